@@ -27,15 +27,14 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.error_inflation import significance_of
+from pyklip_diffrender.detection.candidates import Candidates, Maps
+from pyklip_diffrender.detection.error_factor import Significance
 from pyklip_diffrender.detection.field import separation_of
-from pyklip_diffrender.detection.groups import groups_of
-from pyklip_diffrender.detection.maps import Maps
-from pyklip_diffrender.detection.significance import Significance
+from pyklip_diffrender.detection.search import significance_of
+from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.companions import local_maxima
+from pyklip_diffrender.scene.star_place import local_maxima
 
 Image = NDArray[np.float64]
 

@@ -32,7 +32,7 @@ from typing import Any
 
 from benchmarks import mutations
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.surveys import folders
+from pyklip_diffrender.surveys import jobs
 from pyklip_diffrender.surveys.driver import run_survey
 from pyklip_diffrender.surveys.jobs import Job
 
@@ -178,7 +178,7 @@ def verified(output: Path) -> tuple[dict[str, int], int]:
     for path in (output / "jobs").iterdir():
         if path.name.startswith("."):
             continue
-        record = folders.read_record(path)
+        record = jobs.read_record(path)
         require(record is not None, f"{path}: half a product")
         if record is not None and record["status"] == "failed":
             require([each.name for each in path.iterdir()] == ["job.json"], path)
@@ -188,7 +188,7 @@ def verified(output: Path) -> tuple[dict[str, int], int]:
         for k in range(PARTS):
             content = (path / f"part{k}.bin").read_bytes()
             require(content == part(path.name, k), f"{path}: wrong content")
-        finished[path.name] = (path / folders.RECORD).stat().st_mtime_ns
+        finished[path.name] = (path / jobs.RECORD).stat().st_mtime_ns
     return finished, failed
 
 

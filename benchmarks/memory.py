@@ -21,7 +21,7 @@ from typing import Any
 from astropy.table import Table
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.simulation import model_for
 
 ITERATIONS = 8
 """Memory is largest when the wavefront is fitted, which begins at the third to fifth step."""

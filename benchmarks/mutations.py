@@ -15,7 +15,7 @@ import numpy as np
 from astropy.io import fits
 
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.surveys import folders
+from pyklip_diffrender.surveys import jobs
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.jobs import jobs_of
 
@@ -102,7 +102,7 @@ def _kinds(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
     frames.mkdir()
     for name in ("a.fits", "map.fits"):
         (frames / name).write_bytes(name.encode())
-    record = folder / folders.RECORD
+    record = folder / jobs.RECORD
     known = {"status": "finished", "products": {}, "job": {"key": folder.name}, "result": {}}
     record.write_text(json.dumps(known), encoding="utf-8")
     readers: dict[str, Callable[[Path], Any]] = {
@@ -111,7 +111,7 @@ def _kinds(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
         "fit.fits": Refinement.read,
         "survey.toml": lambda path: jobs_of(read_config(path)),
         # A damaged record is a job that is missing.
-        folders.RECORD: lambda path: folders.read_record(path.parent),
+        jobs.RECORD: lambda path: jobs.read_record(path.parent),
     }
     return {name: ((folder / name).read_bytes(), read) for name, read in readers.items()}
 

@@ -27,7 +27,7 @@ from torch.utils._pytree import tree_leaves
 import pyklip_diffrender as dr
 from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.linear.response import WavefrontResponse
-from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import resample
 

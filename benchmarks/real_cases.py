@@ -33,7 +33,7 @@ from astropy.table import Table, vstack
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.reduction import summarise
-from pyklip_diffrender.reduction.klip_curve import klip_curve, small_sample_factor
+from pyklip_diffrender.reduction.klip import klip_curve, small_sample_factor
 
 SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
 SIZE = 80

@@ -21,7 +21,7 @@ from astropy.table import Table
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.refinement import GaussNewton, refine
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.wavefront.opd import read_opd
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))

@@ -38,8 +38,7 @@ from torch import Tensor
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.linear.frames import LinearFrame
-from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.model import LinearFrame, LinearModel
 from pyklip_diffrender.linear.response import downsample
 
 FAR = 6.0

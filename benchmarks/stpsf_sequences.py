@@ -43,7 +43,7 @@ import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
 from pyklip_diffrender.instrument import detector_place, filter_shift
 from pyklip_diffrender.optics import resample
-from pyklip_diffrender.reduction.klip_curve import klip_curve
+from pyklip_diffrender.reduction.klip import klip_curve
 from pyklip_diffrender.scene import Planet, Sequence
 
 ROLLS = (70.0, 80.0)

@@ -13,7 +13,7 @@ from astropy.table import Table
 from numpydoc.docscrape import NumpyDocString
 
 from pyklip_diffrender.cli import application
-from pyklip_diffrender.io.keywords import KEYWORDS
+from pyklip_diffrender.io.headers import KEYWORDS
 from pyklip_diffrender.reduction import ReduceOptions
 
 __all__ = ["hard_cases", "keywords", "options", "scene_needs", "write_tables"]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         wide_field,
     )
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.instrument.star_flux import star_flux_density
+    from pyklip_diffrender.instrument.spectrum import star_flux_density
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import (
@@ -55,13 +55,11 @@ if TYPE_CHECKING:
     )
     from pyklip_diffrender.scene.objects import Planet, Scene, Star
     from pyklip_diffrender.scene.observation import Observation
-    from pyklip_diffrender.scene.real_frames import model_for
     from pyklip_diffrender.scene.sequence import Sequence
-    from pyklip_diffrender.scene.simulation import simulate
+    from pyklip_diffrender.scene.simulation import model_for, simulate
     from pyklip_diffrender.scene.systematics import Systematics
     from pyklip_diffrender.surveys import survey
-    from pyklip_diffrender.wavefront.map_choice import choose_map
-    from pyklip_diffrender.wavefront.opd import random_opd, read_opd
+    from pyklip_diffrender.wavefront.opd import choose_map, random_opd, read_opd
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
@@ -120,26 +118,24 @@ __all__ = [
 _NAMES = {
     "archive": "fetch_calints list_calints",
     "bridges": "from_poppy from_webbpsf",
-    "detection": "Combination Detection Disk WideField combine completeness contrast_curve detect "
-    "fit_disk measure wide_field",
+    "detection": "Combination combine completeness contrast_curve detect Detection Disk fit_disk "
+    "measure wide_field WideField",
     "instrument.nircam": "nircam_coronagraph",
-    "instrument.star_flux": "star_flux_density",
+    "instrument.spectrum": "star_flux_density",
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",
-    "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
-    "reduction": "Reduction reduce",
-    "pattern": "PatternLibrary combine_libraries known_systematics learn_library learn_systematics",
-    "refinement": "GaussNewton Refinement Status refine",
+    "pyklip_backend": "backend DiffrenderSettings observation_from_dataset register unregister",
+    "reduction": "reduce Reduction",
+    "pattern": "combine_libraries known_systematics learn_library learn_systematics PatternLibrary",
+    "refinement": "GaussNewton refine Refinement Status",
     "scene.objects": "Planet Scene Star",
     "scene.observation": "Observation",
-    "scene.real_frames": "model_for",
+    "scene.simulation": "model_for simulate",
     "scene.sequence": "Sequence",
-    "scene.simulation": "simulate",
     "scene.systematics": "Systematics",
-    "wavefront.map_choice": "choose_map",
+    "wavefront.opd": "choose_map random_opd read_opd",
     "surveys": "survey",
-    "wavefront.opd": "random_opd read_opd",
-    "wavefront.priors": "WavefrontPrior learn_prior",
+    "wavefront.priors": "learn_prior WavefrontPrior",
 }
 """Public names by the module they are in."""
 

@@ -16,7 +16,7 @@ from astropy.table import QTable, Table
 
 from pyklip_diffrender.errors import ArchiveError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits, replacing
-from pyklip_diffrender.io.names import same_name, unknown_name
+from pyklip_diffrender.io.headers import same_name, unknown_name
 from pyklip_diffrender.io.progress import ProgressBar
 
 __all__ = ["cache_folder", "fetch_calints", "list_calints"]

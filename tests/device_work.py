@@ -18,7 +18,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.linear import ResponseCache, field_derivatives, image_derivatives
 from pyklip_diffrender.optics import OpticalSystem, PointSources, PupilGrid
 from pyklip_diffrender.refinement import GaussNewton, Refinement
-from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior
 

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from pyklip_diffrender.detection import Candidates, Detection
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.sky import Sky
+from pyklip_diffrender.detection.field import Sky
 from pyklip_diffrender.scene.observation import Observation
 
 PIXEL = 0.063

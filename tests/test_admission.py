@@ -16,8 +16,7 @@ from astropy.time import Time
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints, starlight
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.scene.catalogue_star import CatalogueStar
-from pyklip_diffrender.scene.exposure import Exposure, beginning, image_mask
+from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure, beginning, image_mask
 
 
 @pytest.fixture

@@ -60,9 +60,9 @@ OWNERS = {
     "mpl_toolkits": ("drawing",),
     "poppy": ("bridges",),
     "pyarrow": ("surveys",),
-    "pyklip": ("pyklip_backend", "reduction.klip_curve", "reduction.klip_rdi"),
+    "pyklip": ("pyklip_backend", "reduction.klip", "reduction.klip"),
     "spaceKLIP": ("spaceklip",),
-    "stpsf": ("bridges", "wavefront.sensing"),
+    "stpsf": ("bridges", "wavefront.wss"),
     "webbpsf": ("bridges",),
 }
 """Libraries, and the packages or modules that alone may import them."""
@@ -226,7 +226,7 @@ GUARDED = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from {}"
         ("optics/a.py", "from .. import errors, instrument", "instrument comes after optics"),
         ("optics/a.py", "def f():\n    from pyklip_diffrender import cli", "a.py:2: cli comes"),
         ("optics/a.py", "from pyklip_diffrender import Scene", "instead of the module it is in"),
-        ("wavefront/a.py", "import stpsf", "only bridges and wavefront.sensing may import stpsf"),
+        ("wavefront/a.py", "import stpsf", "only bridges and wavefront.wss may import stpsf"),
         ("demo.py", "from importlib import import_module\nimport_module('pyklip.fm')", "demo.py:2"),
         ("cli.py", "import os, matplotlib.pyplot as plt", "only drawing may import matplotlib"),
         ("novelty.py", "", "not in PACKAGES"),

@@ -36,13 +36,12 @@ from pyklip_diffrender.pyklip_backend import (
     klip_call,
     subtract_by_refinement,
 )
-from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
+from pyklip_diffrender.pyklip_backend.output_files import on_product, throughput_map
 from pyklip_diffrender.refinement import GaussNewton, Status, refine
-from pyklip_diffrender.scene.detector_pixels import shift_frames
+from pyklip_diffrender.scene.jwst_files import shift_frames
 from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.systematics import Systematics
-from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
@@ -495,7 +494,7 @@ def test_frames_that_were_moved_for_the_fit_are_subtracted_where_they_are(
         registered = replace(frame, data=shifted, center=frame.center + away)
         return PatternChoice((registered,), None, settings.fit)
 
-    monkeypatch.setattr("pyklip_diffrender.pattern.fit.choose_systematics", moved)
+    monkeypatch.setattr("pyklip_diffrender.pattern.choice.choose_systematics", moved)
     settings = DiffrenderSettings(model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)})
     rendered = subtract_by_refinement(observation, OLD, settings)
     inner = np.s_[6:-6, 6:-6]

@@ -23,18 +23,17 @@ from benchmarks.calints_files import SIDE, calints
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Detection, search
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.io.geometry import half_circle
+from pyklip_diffrender.io.units import half_circle
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.pattern import PatternLibrary
 from pyklip_diffrender.pattern.library import package_library
-from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
+from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.refinement import GaussNewton, Refinement, fitting
 from pyklip_diffrender.scene import sequence
-from pyklip_diffrender.scene.detector_pixels import shift_frames
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.jwst_files import shift_frames
+from pyklip_diffrender.scene.observation import Observation, Window
+from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.scene.systematics import Systematics
-from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from stpsf_data import lopsided, lyot_stop, pupil, zernike_tensor
 
 from pyklip_diffrender.bridges import from_webbpsf, opd_to_webbpsf
-from pyklip_diffrender.bridges.orientation import Orientation
-from pyklip_diffrender.bridges.sampled_planes import PupilOptic
+from pyklip_diffrender.bridges.sampled_planes import Orientation, PupilOptic
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -31,10 +30,9 @@ from pyklip_diffrender.errors import (
     UnitError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, zernike_basis
 from pyklip_diffrender.optics.planes import EntrancePupil
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.optics.zernike import zernike_basis
 
 Array = NDArray[np.float64]
 

@@ -28,18 +28,17 @@ from astropy.time import Time
 from benchmarks.calints_files import calints
 from pyklip_diffrender import __version__
 from pyklip_diffrender.cli import application, main
-from pyklip_diffrender.cli.estimate import describe_plan, steps_of
-from pyklip_diffrender.cli.shared_options import read_config
+from pyklip_diffrender.cli.reducing import describe_plan, steps_of
+from pyklip_diffrender.cli.session import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.reduction import UNFINISHED, Preparation, ReduceOptions
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront.map_choice import RULES
-from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, resample
+from pyklip_diffrender.wavefront.opd import RULES, OPDMap, random_opd, resample
 
 # The package has the command under the name of its module.
-doctor = import_module("pyklip_diffrender.cli.doctor")
+doctor = import_module("pyklip_diffrender.cli.application")
 
 PYTHON = re.compile(r"\w=|\bu\.\w|np\.|\w\(\)|[a-z]_[a-z]+:|=\.\.\.|\ba[n]? [A-Z][a-z]+[A-Z]")
 """Signs of Python in a message."""

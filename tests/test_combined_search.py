@@ -21,13 +21,11 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.cli.reducing import combined
 from pyklip_diffrender.detection import Detection, Motion, SkyMap, hypotheses
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.groups import weigh
-from pyklip_diffrender.detection.sky_map import SkyStack
-from pyklip_diffrender.detection.trials import Family
+from pyklip_diffrender.detection.sky_map import Family, SkyStack
+from pyklip_diffrender.detection.templates import weigh
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
-from pyklip_diffrender.linear.frames import Unknown
-from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.model import LinearModel, Unknown
 
 MOTION = (0.3, -0.2)
 YEAR = 365.25

@@ -12,9 +12,12 @@ import torch
 
 import pyklip_diffrender as dr
 from benchmarks.planets import searched
-from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.raised_peaks import with_raised_peaks
-from pyklip_diffrender.detection.relinearise import lacks_candidates, unconfirmed_companions
+from pyklip_diffrender.detection.candidates import (
+    Candidates,
+    lacks_candidates,
+    unconfirmed_companions,
+)
+from pyklip_diffrender.detection.search import with_raised_peaks
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 
 FOUND = Candidates.at([[0.6, 0.3]], [3e-4])

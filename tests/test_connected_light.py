@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pyklip_diffrender.detection.connected_light import ConnectedLight
+from pyklip_diffrender.detection.disk import ConnectedLight
 
 RESOLUTION = 2.3
 

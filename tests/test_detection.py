@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection
-from pyklip_diffrender.detection.calibration import calibration_errors
-from pyklip_diffrender.detection.relinearise import with_companions
+from pyklip_diffrender.detection.candidates import calibration_errors, with_companions
 from pyklip_diffrender.errors import (
     CorruptFileError,
     IncompatibleSetupError,
@@ -35,7 +34,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.linear.frames import Unknown
+from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine

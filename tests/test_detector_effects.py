@@ -10,7 +10,7 @@ from astropy.convolution import convolve
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from pyklip_diffrender.bridges.rotation import SplineRotation
+from pyklip_diffrender.bridges.sampled_planes import SplineRotation
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.optics import (
     ChainDetector,

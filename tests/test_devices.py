@@ -20,7 +20,7 @@ from pretend_device import DEVICE, pretended
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.bridges import from_poppy
-from pyklip_diffrender.bridges.rotation import SplineRotation
+from pyklip_diffrender.bridges.sampled_planes import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
 from pyklip_diffrender.linear import jacobian
 from pyklip_diffrender.optics import GaussianBlur, LinearResampling, PixelCrosstalk

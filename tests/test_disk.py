@@ -17,11 +17,11 @@ from matplotlib.contour import ContourSet
 from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import disk_fit as module
-from pyklip_diffrender.detection.groups import groups_of
+from pyklip_diffrender.detection import disk as module
+from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.product_images import ProductImages
+from pyklip_diffrender.pyklip_backend.output_files import ProductImages
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.wavefront import random_drift
 

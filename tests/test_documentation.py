@@ -22,7 +22,7 @@ import pytest
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.cli import application
-from pyklip_diffrender.io.keywords import KEYWORDS
+from pyklip_diffrender.io.headers import KEYWORDS
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.wavefront.opd import OPDMap
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import gaussian_filter
 
-from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.significance import Significance
+from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance
 
 PIXEL = 0.06
 RESOLUTION = 0.15

@@ -15,15 +15,15 @@ from torch import Tensor
 import pyklip_diffrender as dr
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.refinement.accurate_step import (
+from pyklip_diffrender.refinement.forward import Problem, State
+from pyklip_diffrender.refinement.solver import (
     ModelDerivatives,
+    Solver,
+    StepState,
     accurate_step,
     conjugate_gradients,
+    linearise,
 )
-from pyklip_diffrender.refinement.normal_equations import linearise
-from pyklip_diffrender.refinement.objective import State
-from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.scene import Systematics
 from pyklip_diffrender.wavefront import WavefrontPrior, default_basis
 

@@ -11,7 +11,7 @@ import pytest
 from astropy import units as u
 from astropy.io import fits
 
-from pyklip_diffrender.io.keywords import KEYWORDS, fits_unit, set_keyword
+from pyklip_diffrender.io.headers import KEYWORDS, fits_unit, set_keyword
 
 ROOT = Path(__file__).resolve().parents[1]
 

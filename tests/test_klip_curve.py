@@ -21,7 +21,7 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.reduction.klip_curve import klip_curve, small_sample_factor
+from pyklip_diffrender.reduction.klip import klip_curve, small_sample_factor
 from pyklip_diffrender.refinement import FrameFit
 
 NPIX, SIZE = 64, 32

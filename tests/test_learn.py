@@ -18,7 +18,7 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
 )
 from pyklip_diffrender.pattern import MeasuredPattern, choose_systematics, package_library
-from pyklip_diffrender.pyklip_backend.checks import check_settings
+from pyklip_diffrender.pyklip_backend.klip_call import check_settings
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.refinement import GaussNewton
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.linear.frames import LinearFrame, Unknown
-from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.model import LinearFrame, LinearModel, Unknown
 
 NY, NX = 6, 7
 SHARED, DRIFT = 6, 2

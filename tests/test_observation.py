@@ -21,7 +21,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.linear.response import coarse_copy
-from pyklip_diffrender.optics.fast.occulter import finest_spacing
+from pyklip_diffrender.optics.fast_path import finest_spacing
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.observation import Observation
 

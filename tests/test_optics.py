@@ -19,9 +19,9 @@ from pyklip_diffrender.instrument.masks import FILTERS, MASKS
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.fast.point_sources import PointSources
-from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics.planes import MatrixFourier
+from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
 from pyklip_diffrender.wavefront.opd import random_opd

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 import torch
 
-from pyklip_diffrender.bridges.orientation import Orientation
+from pyklip_diffrender.bridges.sampled_planes import Orientation
 
 
 def random(size: int) -> torch.Tensor:

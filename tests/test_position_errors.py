@@ -10,11 +10,12 @@ import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Candidates
-from pyklip_diffrender.detection.candidates import refine_candidates
-from pyklip_diffrender.detection.groups import groups_of
-from pyklip_diffrender.detection.position_errors import with_position_of_star
-from pyklip_diffrender.detection.relinearise import in_derivatives
-from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.detection.candidates import (
+    in_derivatives,
+    refine_candidates,
+    with_position_of_star,
+)
+from pyklip_diffrender.detection.templates import Templates, groups_of
 from pyklip_diffrender.optics import PupilGrid
 
 BRIGHT, FAINT = (0.45, 0.5), (-0.6, 0.2)

@@ -21,7 +21,7 @@ from pyklip_diffrender.errors import (
     UnitError,
 )
 from pyklip_diffrender.io import to_number, to_pair
-from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.wavefront import SegmentMotions, as_opd_map, random_drift
 
 OPD = dr.random_opd(1, npix=64).data

@@ -32,7 +32,7 @@ from pyklip_diffrender.refinement import (
     Status,
     refine,
 )
-from pyklip_diffrender.refinement.status import breakdown_explained
+from pyklip_diffrender.refinement.fit_result import breakdown_explained
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import (
     FourierModes,

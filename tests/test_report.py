@@ -29,23 +29,29 @@ import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.geometry import full_circle, half_circle
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.io.units import full_circle, half_circle
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction import existing_products, summarise, write_report
-from pyklip_diffrender.reduction.extended import looks_extended
-from pyklip_diffrender.reduction.overview import Klip, Overview
-from pyklip_diffrender.reduction.pages import Picture, write_figures
-from pyklip_diffrender.reduction.pictures import ReportPictures, _measured, _stamps
-from pyklip_diffrender.reduction.report import page
-from pyklip_diffrender.reduction.sky_images import SkyImages
-from pyklip_diffrender.reduction.words import (
+from pyklip_diffrender.reduction.pages import (
+    Picture,
     advice,
     depth_against_klip,
     plus_minus,
     probability,
     scientific,
+    write_figures,
 )
+from pyklip_diffrender.reduction.pictures import (
+    Klip,
+    Overview,
+    ReportPictures,
+    SkyImages,
+    _measured,
+    _stamps,
+)
+from pyklip_diffrender.reduction.products import page
+from pyklip_diffrender.reduction.reduction_result import looks_extended
 from pyklip_diffrender.refinement import Status
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)

@@ -19,7 +19,7 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.io.names import same_name
+from pyklip_diffrender.io.headers import same_name
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern import learn_systematics
 from pyklip_diffrender.reduction import reduce

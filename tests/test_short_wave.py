@@ -28,7 +28,7 @@ from pyklip_diffrender.scene import (
     model_for,
     simulate,
 )
-from pyklip_diffrender.scene.detector_pixels import mask_place
+from pyklip_diffrender.scene.jwst_files import mask_place
 from pyklip_diffrender.wavefront import random_opd
 
 SIZE = 36

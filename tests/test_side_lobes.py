@@ -10,12 +10,11 @@ import torch
 
 import pyklip_diffrender as dr
 from benchmarks.planets import searched
-from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.candidates import Candidates, Maps
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import separation_of
-from pyklip_diffrender.detection.groups import groups_of
-from pyklip_diffrender.detection.maps import Maps
-from pyklip_diffrender.detection.side_lobes import side_lobes
+from pyklip_diffrender.detection.search import side_lobes
+from pyklip_diffrender.detection.templates import groups_of
 
 HIDDEN, PLANET, LOBE = (0.1, -0.08), (-0.3, 0.5), (0.22, 0.3)
 UNIT = ErrorFactor.constant(1.0)

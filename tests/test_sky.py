@@ -19,11 +19,10 @@ from astropy.wcs import WCS
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Candidates
-from pyklip_diffrender.detection.candidate_tables import candidate_table, measured_table
-from pyklip_diffrender.detection.contrast import contrast_table
-from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.orbits import write_astrometry
-from pyklip_diffrender.detection.sky import Positions, Sky
+from pyklip_diffrender.detection.detection_file import write_astrometry
+from pyklip_diffrender.detection.error_factor import ErrorFactor, contrast_table
+from pyklip_diffrender.detection.field import Positions, Sky
+from pyklip_diffrender.detection.measurement import candidate_table, measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import detector_place
 from pyklip_diffrender.refinement import FrameFit, jansky_per_unit, require_calibrated, to_jansky

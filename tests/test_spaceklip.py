@@ -20,9 +20,9 @@ from pyklip.parallelized import klip_dataset
 from benchmarks.calints_files import calints
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Candidates, Detection
-from pyklip_diffrender.detection.candidate_tables import candidate_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.sky import Sky
+from pyklip_diffrender.detection.field import Sky
+from pyklip_diffrender.detection.measurement import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.optics import OpticalSystem
@@ -31,10 +31,10 @@ from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.spaceklip import run
 from pyklip_diffrender.spaceklip.database_files import (
     complete_header,
+    source_table,
     write_contrast,
     write_database,
 )
-from pyklip_diffrender.spaceklip.sources import source_table
 from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")

@@ -18,11 +18,11 @@ from survey_stubs import configuration, inputs
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
 from pyklip_diffrender.cli.application import application
-from pyklip_diffrender.cli.shared_options import read_config as command_config
-from pyklip_diffrender.instrument.star_flux import read_spectrum
+from pyklip_diffrender.cli.session import read_config as command_config
+from pyklip_diffrender.instrument.spectrum import read_spectrum
 from pyklip_diffrender.io.files import fits_files, is_fits_name
 from pyklip_diffrender.pattern import PatternLibrary, package_library
-from pyklip_diffrender.scene.frame_files import exposures_in
+from pyklip_diffrender.scene.admission import exposures_in
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.jobs import jobs_of
 from pyklip_diffrender.wavefront import choose_map, random_opd
@@ -190,7 +190,7 @@ def test_configurations_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None
 
 
 def test_records_of_a_survey_may_have_been_saved_with_a_mark(tmp_path: Path) -> None:
-    from pyklip_diffrender.surveys.folders import RECORD, read_record
+    from pyklip_diffrender.surveys.jobs import RECORD, read_record
 
     key = tmp_path.name.rpartition("_")[2]
     record = {"status": "finished", "job": {"key": key}, "products": {}}

@@ -38,12 +38,21 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.refinement import FrameFit, GaussNewton
-from pyklip_diffrender.surveys import execution, folders, runs, survey_page, work
+from pyklip_diffrender.surveys import (
+    execution,
+    survey_page,
+)
+from pyklip_diffrender.surveys import (
+    execution as work,
+)
+from pyklip_diffrender.surveys import (
+    jobs as folders,
+)
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
+from pyklip_diffrender.surveys.execution import Work
 from pyklip_diffrender.surveys.jobs import Injection, Job, jobs_of
-from pyklip_diffrender.surveys.runs import Work
-from pyklip_diffrender.surveys.tables import COLUMNS, table_of
+from pyklip_diffrender.surveys.survey_page import COLUMNS, table_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -417,10 +426,10 @@ def test_what_another_survey_published_meanwhile_stays(tmp_path: Path) -> None:
 
     def work(inner: Job, folder: Path) -> dict[str, Any]:
         if inner.opd != "rival":
-            assert runs.run_job(rival, jobs, work)["status"] == "finished"
+            assert execution.run_job(rival, jobs, work)["status"] == "finished"
         return stub(inner, folder)
 
-    assert runs.run_job(job, jobs, work)["status"] == "finished"
+    assert execution.run_job(job, jobs, work)["status"] == "finished"
     record = folders.read_record(jobs / job.folder)
     assert record is not None
     assert record["job"]["opd"] == "rival"
@@ -517,7 +526,7 @@ def test_a_worker_that_sees_something_else_says_so(tmp_path: Path, what: str) ->
         job = replace(job, version="99.0")
     else:
         shutil.rmtree(jobs)
-    record = runs.run_job(job, jobs, stub)
+    record = execution.run_job(job, jobs, stub)
     assert record["status"] == "failed"
     assert words[what] in record["message"]
     # A worker must not make the folder on a disk of its own.
@@ -624,7 +633,8 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, miss
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, f"{missing}.distributed", None)
     monkeypatch.setattr(
-        "pyklip_diffrender.surveys.tables.find_spec", lambda name: None if name == missing else 1
+        "pyklip_diffrender.surveys.survey_page.find_spec",
+        lambda name: None if name == missing else 1,
     )
     if missing == "dask":
         with pytest.raises(IncompatibleSetupError, match=r"pip install .dask\[.*workers = 0"):
@@ -676,14 +686,14 @@ def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path: Path
 
     with pytest.raises(RefinementError, match="scheduler was lost"):
         execution._record_of(Future(), job, jobs)
-    record = runs.run_job(job, jobs, stub)
+    record = execution.run_job(job, jobs, stub)
     assert execution._record_of(Future(), job, jobs) == record
 
 
 @pytest.fixture
 def do(monkeypatch: pytest.MonkeyPatch) -> Callable[[Work], None]:
     """Give the command other work than reductions."""
-    return partial(monkeypatch.setattr, "pyklip_diffrender.surveys.work.reduce_job")
+    return partial(monkeypatch.setattr, "pyklip_diffrender.surveys.execution.reduce_job")
 
 
 @pytest.mark.parametrize("broken", [False, True])

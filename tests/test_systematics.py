@@ -17,13 +17,15 @@ from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern.measure import (
+    lacks_pattern,
     learn_systematics,
+    light_and_residual,
+    pattern_pedestal,
+    pattern_size,
 )
-from pyklip_diffrender.pattern.pedestal import light_and_residual, pattern_pedestal
-from pyklip_diffrender.pattern.presence import lacks_pattern, pattern_size
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Status
-from pyklip_diffrender.refinement.continuation import refine_again
-from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.fitting import refine_again
+from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics

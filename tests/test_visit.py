@@ -17,7 +17,7 @@ from astropy.time import Time
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import sources_of_references
-from pyklip_diffrender.linear.frames import FrameRows
+from pyklip_diffrender.linear.model import FrameRows
 from pyklip_diffrender.pattern import PatternChoice, choose_systematics, pattern_for_visit
 from pyklip_diffrender.reduction import (
     Preparation,
@@ -28,7 +28,7 @@ from pyklip_diffrender.reduction import (
 )
 from pyklip_diffrender.reduction.visit import rough_settings, with_references
 from pyklip_diffrender.refinement import GaussNewton, Refinement, align_frame, join_frames, refine
-from pyklip_diffrender.refinement.mode_priors import ModePriors, exposure_sequences
+from pyklip_diffrender.refinement.solver import ModePriors, exposure_sequences
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -199,7 +199,11 @@ def test_limits_are_compared_as_they_are_stated() -> None:
         # With references, the S/N scatters by twice as much as it should.
         return dr.detect(one, scatter=float(len(searched)), relinearise=1e9)
 
-    kept, visit, detection = with_references(fit, choice, [reference(0)], search=search)
+    frames = [reference(k) for k in range(3)]
+    kept, visit, detection = with_references(fit, choice, frames[:2], search=search)
+    assert (kept, detection) == (fit, None)
+    assert "add little to the library's pattern" in visit.contributions[0].reason
+    kept, visit, detection = with_references(fit, choice, frames, search=search)
     assert searched[0] is fit
     assert len(searched) == 2
     assert kept is fit

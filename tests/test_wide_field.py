@@ -13,7 +13,7 @@ from astropy.table import QTable
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection, WideField, wide_field, wide_search
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.whole_frames import WholeFrame
+from pyklip_diffrender.detection.wide_search import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 WHOLE, FITTED = 120, 48

@@ -15,8 +15,7 @@ from benchmarks.speed.case import Accuracy, Case
 from benchmarks.speed.rivals import paper_recipe
 from benchmarks.speed.setting import Setting, coarse_steps
 from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
-from pyklip_diffrender.linear.mode_fields import NANOMETRE
-from pyklip_diffrender.linear.response import WavefrontResponse, downsample
+from pyklip_diffrender.linear.response import NANOMETRE, WavefrontResponse, downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import GaussNewton, Refinement, refine

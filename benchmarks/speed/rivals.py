@@ -19,8 +19,8 @@ from torch import Tensor
 from benchmarks.speed.setting import WAVELENGTH, Arrays
 from pyklip_diffrender.instrument.masks import MASKS
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.fourier import kernel
 from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.planes import kernel
 
 __all__ = ["hcipy_image", "load", "paper_recipe", "prysm_image"]
 

@@ -20,7 +20,7 @@ from scene import Frame, Image, Planet, Setting, Star
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.metrics import annulus_snr, throughput
-from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.refinement import Refinement
 
 FIELD = (0.3, 2.3)

@@ -15,7 +15,7 @@ from scene import Frame, Image, Planet, Scene, Setting, Star, planet_photons, st
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.demo import simulate_references
-from pyklip_diffrender.reduction.klip_rdi import klip_rdi
+from pyklip_diffrender.reduction.klip import klip_rdi
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2
 from pyklip_diffrender.scene.simulation import simulate

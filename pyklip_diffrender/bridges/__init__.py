@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pyklip_diffrender.bridges.poppy import from_poppy, opd_to_poppy
     from pyklip_diffrender.bridges.webbpsf import from_webbpsf, opd_to_webbpsf
-    from pyklip_diffrender.wavefront.map_files import opd_to_hdus
+    from pyklip_diffrender.wavefront.opd_map import opd_to_hdus
     from pyklip_diffrender.wavefront.wss import load_wss_opd, load_wss_opd_by_date
 
 __all__ = [
@@ -29,7 +29,7 @@ _MODULE_OF = {
     "from_webbpsf": "bridges.webbpsf",
     "load_wss_opd": "wavefront.wss",
     "load_wss_opd_by_date": "wavefront.wss",
-    "opd_to_hdus": "wavefront.map_files",
+    "opd_to_hdus": "wavefront.opd_map",
     "opd_to_poppy": "bridges.poppy",
     "opd_to_webbpsf": "bridges.webbpsf",
 }

@@ -15,39 +15,34 @@ from poppy.poppy_core import PlaneType
 from torch import Tensor
 
 from pyklip_diffrender.bridges.image_masks import (
+    COMPACT_OPTICS,
     BoxPart,
     FourierMask,
+    ImageSamples,
     MaskPart,
+    MaskStack,
     SampledOcculter,
     SeparablePart,
+    complement_box,
     padded_pupil,
+    pupil_phasor,
 )
-from pyklip_diffrender.bridges.orientation import (
+from pyklip_diffrender.bridges.sampled_planes import (
+    FreeRotation,
+    Gain,
+    MovableStop,
     Orientation,
+    OrientedPupil,
+    PupilOptic,
     free_turn,
     is_quarter_turn,
     turns_behind,
 )
-from pyklip_diffrender.bridges.rotation import FreeRotation
-from pyklip_diffrender.bridges.sampled_planes import (
-    Gain,
-    MovableStop,
-    OrientedPupil,
-    PupilOptic,
-)
-from pyklip_diffrender.bridges.sampling import (
-    COMPACT_OPTICS,
-    ImageSamples,
-    MaskStack,
-    complement_box,
-    pupil_phasor,
-)
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.planes import Plane
+from pyklip_diffrender.optics.planes import Detector, Plane
 
 __all__ = ["Conversion"]
 

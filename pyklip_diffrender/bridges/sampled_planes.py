@@ -1,34 +1,248 @@
 """Planes made from sampled arrays in any orientation.
 
-Inside a system all pupil arrays have the frame in which `fourier` makes the final image. The planes
-here take arrays in the frame of their own plane and turn them.
+Inside a system all pupil arrays have the frame in which `MatrixFourier` makes the final image. The
+planes of this module take arrays in the frame of their own plane and turn them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
+from poppy.poppy_core import PlaneType
+from scipy.ndimage import spline_filter1d
 from torch import Tensor
 
-from pyklip_diffrender.bridges.orientation import Orientation
-from pyklip_diffrender.io.geometry import rotation_matrix
-from pyklip_diffrender.optics.differentiation import Cache, Position, cached, position_of
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.planes import EntrancePupil, Plane, Values, Wavefront, phase_factor
-from pyklip_diffrender.optics.zernike import zernike_basis
+from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.optics.grid import PupilGrid, zernike_basis
+from pyklip_diffrender.optics.planes import (
+    Cache,
+    EntrancePupil,
+    Plane,
+    Position,
+    Values,
+    Wavefront,
+    cached,
+    phase_factor,
+    position_of,
+)
 from pyklip_diffrender.parameters import parameter
 
 __all__ = [
     "AberrationOptic",
+    "FreeRotation",
     "Gain",
     "MovableStop",
+    "Orientation",
     "OrientedPupil",
     "PupilOptic",
+    "SplineRotation",
+    "free_turn",
+    "is_quarter_turn",
+    "turns_behind",
 ]
+
+
+# Flips and quarter turns between the frames of successive planes, kept exact; other turns.
+
+Matrix = tuple[tuple[int, int], tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """A symmetry of the square, one of eight, as the matrix that acts on positions (x, y).
+
+    Attributes
+    ----------
+    matrix : 2 x 2 of int
+        New position from old: ``x' = m[0][0] x + m[0][1] y`` and likewise for ``y'``.
+    """
+
+    matrix: Matrix = ((1, 0), (0, 1))
+
+    @classmethod
+    def inversion(cls, axis: str) -> Orientation:
+        """Change of sign of "x", "y" or "both"."""
+        return cls(((-1 if axis in ("x", "both") else 1, 0), (0, -1 if axis != "x" else 1)))
+
+    @classmethod
+    def quarter_turns(cls, count: int) -> Orientation:
+        """Counter-clockwise rotation (from +x to +y) by `count` times 90 deg."""
+        turned = cls()
+        for _ in range(count % 4):
+            turned = turned.then(cls(((0, -1), (1, 0))))
+        return turned
+
+    def then(self, later: Orientation) -> Orientation:
+        """Return the change, followed by another."""
+        a, b = later.matrix, self.matrix
+        rows = [[sum(a[i][k] * b[k][j] for k in (0, 1)) for j in (0, 1)] for i in (0, 1)]
+        return Orientation(((rows[0][0], rows[0][1]), (rows[1][0], rows[1][1])))
+
+    @property
+    def inverse(self) -> Orientation:
+        """The change back; the matrix is orthogonal."""
+        ((a, b), (c, d)) = self.matrix
+        return Orientation(((a, c), (b, d)))
+
+    @property
+    def sense(self) -> int:
+        """1 if counter-clockwise stays counter-clockwise, -1 in a mirror."""
+        ((a, b), (c, d)) = self.matrix
+        return a * d - b * c
+
+    def positions(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """New positions of points."""
+        ((a, b), (c, d)) = self.matrix
+        return a * x + b * y, c * x + d * y
+
+    def apply(self, array: Tensor) -> Tensor:
+        """Turn an array (..., n, n) whose middle is the middle of the array."""
+        return self._turn(array, roll=0)
+
+    def apply_to_lattice(self, array: Tensor) -> Tensor:
+        """Turn an array (..., n, n) whose middle is sample n // 2, as after an FFT, n even.
+
+        The samples at ``-n / 2`` have no mirror image and stay, because they are periodic.
+        """
+        return self._turn(array, roll=1)
+
+    def _turn(self, array: Tensor, roll: int) -> Tensor:
+        ((a, b), (c, d)) = self.matrix
+        if a == 0:
+            array = array.transpose(-1, -2)
+        for sign, axis in ((a + b, -1), (c + d, -2)):
+            if sign < 0:
+                array = torch.roll(array.flip(axis), roll, axis) if roll else array.flip(axis)
+        return array
+
+
+def is_quarter_turn(optic: Any) -> bool:
+    """Whether a plane rotates by a multiple of 90 degrees."""
+    return bool(
+        optic.planetype == PlaneType.rotation and round(optic.angle / 90) * 90 == optic.angle
+    )
+
+
+def turns_behind(planes: Sequence[Any]) -> list[Orientation]:
+    """For every plane, the product of all quarter turns and inversions behind it."""
+    turns, turn = [], Orientation()
+    for optic in reversed(planes):
+        turns.append(turn)
+        if optic.planetype == PlaneType.inversion:
+            turn = Orientation.inversion(optic.axis).then(turn)
+        elif is_quarter_turn(optic):
+            turn = Orientation.quarter_turns(round(optic.angle / 90)).then(turn)
+    return turns[::-1]
+
+
+def free_turn(planes: Sequence[Any]) -> float:
+    """Rotation of the image by planes that turn by other than right angles, degrees."""
+    total, sense = 0.0, 1
+    for optic in reversed(planes):
+        if optic.planetype == PlaneType.inversion and optic.axis != "both":
+            sense = -sense
+        elif optic.planetype == PlaneType.rotation and not is_quarter_turn(optic):
+            total += optic.angle * sense
+    return total
+
+
+# Rotation of a sampled pupil field by any angle, as in poppy.
+
+
+class SplineRotation:
+    """Cubic-spline rotation of arrays: `scipy.ndimage.rotate` as a linear torch function.
+
+    Parameters
+    ----------
+    angle : float
+        Degrees, from the first axis of the array to the second, as scipy counts.
+    shape : tuple of int
+        Rows and columns, of the output as well.
+    """
+
+    def __init__(self, angle: float, shape: tuple[int, int]) -> None:
+        self._filters = [
+            torch.from_numpy(spline_filter1d(np.eye(n), order=3, axis=0)) for n in shape
+        ]
+        cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        half = [(n - 1) / 2 for n in shape]
+        y = (torch.arange(shape[0], dtype=torch.float64) - half[0])[:, None]
+        x = (torch.arange(shape[1], dtype=torch.float64) - half[1])[None, :]
+        from_row = cosine * y + sine * x + half[0]
+        from_column = -sine * y + cosine * x + half[1]
+        self._rows = self._taps(from_row, shape[0])
+        self._columns = self._taps(from_column, shape[1])
+        self._inside = (
+            (from_row >= 0)
+            & (from_row <= shape[0] - 1)
+            & (from_column >= 0)
+            & (from_column <= shape[1] - 1)
+        )
+
+    @staticmethod
+    def _taps(position: Tensor, size: int) -> list[tuple[Tensor, Tensor]]:
+        """Index and weight of the four spline coefficients around every position."""
+        first = torch.floor(position)
+        t = position - first
+        weights = (
+            (1 - t) ** 3 / 6,
+            (3 * t**3 - 6 * t**2 + 4) / 6,
+            (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6,
+            t**3 / 6,
+        )
+        taps = []
+        for k, weight in enumerate(weights):
+            index = (first.to(torch.int64) + k - 1).abs()
+            index = torch.where(index > size - 1, 2 * (size - 1) - index, index)
+            taps.append((index.clamp(0, size - 1), weight))
+        return taps
+
+    def __call__(self, array: Tensor) -> Tensor:
+        """Rotate (..., rows, columns), real or complex, with zeros outside the array."""
+        kind = array.dtype
+        real = torch.float32 if kind in (torch.float32, torch.complex64) else torch.float64
+        device = array.device
+        down, across = (matrix.to(device, kind) for matrix in self._filters)
+        coefficients = down @ array @ across.T
+        total = torch.zeros_like(coefficients)
+        for rows, row_weight in self._rows:
+            for columns, column_weight in self._columns:
+                weight = (row_weight * column_weight * self._inside).to(device, real)
+                total = total + coefficients[..., rows.to(device), columns.to(device)] * weight
+        return total
+
+
+class FreeRotation(Plane):
+    """A rotation of the field in a pupil by any angle.
+
+    Parameters
+    ----------
+    angle : float
+        Degrees, counter-clockwise (from +x to +y), frame of the system.
+    """
+
+    def __init__(self, angle: float, npix: int, diameter: float, name: str) -> None:
+        self.name = name
+        self._full = PupilGrid.full(npix, diameter)
+        self._rotation = SplineRotation(-angle, (npix, npix))
+
+    def window(self, values: Values) -> PupilGrid:
+        """The whole pupil."""
+        return self._full
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """Rotate the field on the array of the pupil."""
+        field = self._rotation(wavefront.grid.crop(wavefront.field, self._full))
+        return replace(wavefront, field=self._full.crop(field, onto), grid=onto)
+
+
+# Planes made from sampled arrays in any orientation.
 
 
 class OrientedPupil(EntrancePupil):

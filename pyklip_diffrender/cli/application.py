@@ -4,20 +4,652 @@ from __future__ import annotations
 
 import logging
 import os
+import platform
+import shutil
+import time
 from collections import abc
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from pyklip_diffrender._version import __version__
-from pyklip_diffrender.cli import commands
-from pyklip_diffrender.cli.doctor import doctor
-from pyklip_diffrender.cli.learning import learn
-from pyklip_diffrender.cli.session import PROGRAM, Run, open_streams
-from pyklip_diffrender.cli.shared_options import common
-from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.cli.session import (
+    PROGRAM,
+    Command,
+    Run,
+    archive,
+    common,
+    file_type,
+    free_memory,
+    open_streams,
+    option,
+    outputs,
+    require_frames,
+    search,
+    together,
+    wavefront,
+)
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 
-__all__ = ["application", "main"]
+if TYPE_CHECKING:
+    from pyklip_diffrender.scene.sequence import Sequence
+    from pyklip_diffrender.wavefront.opd import Rule
+
+__all__ = [
+    "Check",
+    "application",
+    "demo",
+    "detect_in_file",
+    "doctor",
+    "learn",
+    "main",
+    "psf",
+    "reduce_frames",
+    "survey",
+]
+
+
+# The commands that compute something.
+
+_DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
+
+
+@click.command(
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender demo
+  pyklip-diffrender demo --contrast 3e-7 --separation 1 -o faint""",
+)
+@option("--contrast", type=click.FloatRange(min=0), default=1e-6, show_default=True,
+        metavar="RATIO", help="Flux of the planet over that of the star.")  # fmt: skip
+@option("--separation", type=click.FloatRange(0, 2.3), default=0.6, show_default=True,
+        metavar="ARCSEC", help="Separation of the planet from the star.")  # fmt: skip
+@option("--hours", type=click.FloatRange(min=0), default=40.0, show_default=True, metavar="H",
+        help="Age of the wavefront map.")  # fmt: skip
+@option("--seed", type=int, default=1, show_default=True, metavar="N",
+        help="Random seed of wavefront, drift and noise.")  # fmt: skip
+@outputs("diffrender-demo")
+@click.pass_obj
+def demo(
+    run: Run,
+    contrast: float,
+    separation: float,
+    hours: float,
+    seed: int,
+    output: Path,
+    overwrite: bool,
+) -> None:
+    """Show KLIP and wavefront refinement side by side on a simulated planet.
+
+    Needs no data, half a minute and 2 GB of memory.
+    """
+    run.claim_folder(output, _DEMO, overwrite)
+    from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
+    from pyklip_diffrender.drawing import save
+
+    result = run_demo(
+        contrast=contrast,
+        separation=separation,
+        hours=hours,
+        seed=seed,
+        progress=run.progress,
+        device=run.device,
+    )
+    written = write_demo(result, output)
+    figure = output / "demo.png"
+    save(draw_demo(result), figure)
+    click.echo()
+    click.echo("\n".join(result.table.pformat(max_lines=-1, max_width=-1)))
+    click.echo(
+        f"\nA planet of contrast {contrast:g} at {separation:g} arcsec; the "
+        f"wavefront map is {hours:g} h old.\nSNR: the paper's, in the planet's annulus. "
+        "Throughput: fraction of the planet's light that is kept;\nit says nothing where much of "
+        "the star remains, as with the initial map. Star error: rms\nresidual of the star in that "
+        "annulus, in units of the noise.\n"
+        f"Refinement: {result.fit.status}.\n\n"
+        "Point sources with the wavefront marginalised, which loses none of the planet:"
+    )
+    for row in result.detection.candidates:
+        click.echo(
+            f"  {row['separation'].to_value('arcsec'):.3f} arcsec at "
+            f"{row['position_angle'].to_value('deg'):.1f} deg: contrast {row['contrast']:.2e} +- "
+            f"{row['contrast_error']:.1e}, S/N {row['snr']:.1f}"
+        )
+    if not len(result.detection.candidates):
+        click.echo(f"  none above {result.detection.threshold:g} sigma")
+    click.echo(f"\nwrote {figure} and {len(written)} more files")
+
+
+def _star_callback(
+    ctx: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[float, float] | None:
+    """The position of a star from "x,y"."""
+    if text is None:
+        return None
+    try:
+        x, y = (float(part) for part in str(text).strip("()[] ").split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"got {text!r}, expected x,y of the star in pixels from 0, such as 150,174.2",
+            ctx, parameter,
+        ) from None  # fmt: skip
+    return x, y
+
+
+_STAR = option(
+    "--star", metavar="X,Y", section="Frames", callback=_star_callback,
+    help="Where the target's star is in its files, pixels from 0, in place of what the headers say "
+         "and whatever else the frames show.",
+)  # fmt: skip
+
+
+@click.command(
+    "reduce",
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender reduce frames --opd maps -o products
+  pyklip-diffrender reduce frames --target G-7-34 --filter F444W --opd map.fits -o products
+  pyklip-diffrender reduce frames --opd maps -o products --dry-run
+  pyklip-diffrender reduce --program 1184 --target G-7-34 --filter F444W --opd map.fits -o out""",
+)
+@click.argument("frames", type=file_type(), nargs=-1)
+@option("--target", metavar="STAR", section="Frames",
+        help="Name of the target, in any spelling; the other stars are references.")  # fmt: skip
+@option(
+    "--filter",
+    metavar="NAME",
+    section="Frames",
+    help="Which filter; default: all of the target's, one by one.",
+)
+@_STAR
+@archive
+@wavefront
+@search
+@together
+@outputs()
+@click.pass_obj
+def reduce_frames(
+    run: Run,
+    /,
+    frames: tuple[Path, ...],
+    target: str | None,
+    filter: str | None,
+    star: tuple[float, float] | None,
+    program: int | None,
+    cache: Path | None,
+    **options: Any,
+) -> None:
+    """Subtract the star from all rolls of a target and search for planets.
+
+    FRAMES are calints files, or one folder of them. With --program they come from MAST. Filters,
+    and epochs more than 5 days apart, are reduced one by one, into a folder for each, then searched
+    together, and compared on one page.
+    """
+    require_frames(frames, program)
+
+    def read() -> tuple[Sequence, ...]:
+        from pyklip_diffrender.archive import fetch_calints
+        from pyklip_diffrender.scene.sequence import Sequence
+
+        files: Any = frames[0] if len(frames) == 1 else frames
+        if program is not None:
+            if options["dry_run"] and _is_to_fetch(program, target, filter, cache):
+                return ()
+            files = fetch_calints(
+                program, target, filter=filter, folder=cache, progress=run.progress
+            )
+        return Sequence.by_filter_and_epoch(files, target=target, filter=filter, star=star)
+
+    from pyklip_diffrender.cli.reducing import run_reduction
+
+    run_reduction(run, read, **options)
+
+
+@click.command(
+    "detect",
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender detect calints.fits --opd map.fits -o products
+  pyklip-diffrender detect calints.fits --opd maps --opd-date before -o products
+  pyklip-diffrender detect calints.fits --opd maps -o products --json | jq .sentence""",
+)
+@click.argument("frames", type=file_type())
+@_STAR
+@wavefront
+@search
+@outputs()
+@click.pass_obj
+def detect_in_file(
+    run: Run, /, frames: Path, star: tuple[float, float] | None, **options: Any
+) -> None:
+    """Subtract the star from a single file and search for planets.
+
+    FRAMES is a calints file.
+    """
+
+    def read() -> tuple[Sequence, ...]:
+        from pyklip_diffrender.scene.sequence import Sequence
+
+        if frames.is_dir():
+            raise IncompatibleSetupError(
+                f"{frames} is a folder, expected a file; the command reduce takes folders"
+            )
+        return (Sequence.from_files([frames], star=star),)
+
+    from pyklip_diffrender.cli.reducing import run_reduction
+
+    run_reduction(run, read, **options)
+
+
+@click.command(
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender psf --filter F356W --offset 0.02 0 -o star.fits
+  pyklip-diffrender psf --filter F460M --mask MASKLWB -o star.fits
+  pyklip-diffrender psf --monochromatic 4.5e-6 --opd map.fits -o star.fits""",
+)
+@option("--filter", default="F444W", show_default=True, metavar="NAME", help="Filter of NIRCam.")
+@option("--mask", default="MASK335R", show_default=True, metavar="NAME",
+        help="Coronagraph mask of NIRCam.")  # fmt: skip
+@option("--monochromatic", type=float, metavar="M", help="A single wavelength, m.")
+@option("--opd", default="flat", show_default=True, metavar="FILE|flat",
+        help="Wavefront map: a FITS file, or flat.")  # fmt: skip
+@option("--size", type=click.IntRange(min=1), default=80, show_default=True, metavar="N",
+        help="Side of the image, pixels.")  # fmt: skip
+@option("--offset", type=float, nargs=2, default=(0.0, 0.0), show_default=True,
+        metavar="X Y", help="Star from the occulter's centre, arcsec.")  # fmt: skip
+@outputs(file="The FITS file to write.")
+@click.pass_obj
+def psf(
+    run: Run,
+    output: Path,
+    filter: str,
+    mask: str,
+    monochromatic: float | None,
+    opd: str,
+    size: int,
+    offset: tuple[float, float],
+    overwrite: bool,
+) -> None:
+    """Write the image of a star behind the coronagraph."""
+    run.claim_file(output, overwrite)
+    import numpy as np
+    from astropy.io import fits
+
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.io.files import write_fits
+    from pyklip_diffrender.io.headers import fits_text
+    from pyklip_diffrender.wavefront.opd import as_opd_map, resample
+
+    model = nircam_coronagraph(
+        filter,
+        image_mask=mask,
+        monochromatic=monochromatic,
+        fov_pixels=size,
+        device=run.device,
+    )
+    edge = size / 2 * min(model.detector.pixelscale)
+    if not np.abs(offset).max() < edge:
+        raise IncompatibleSetupError(
+            f"offset: got {offset[0]:g} {offset[1]:g}, expected a star inside the image, less "
+            f"than {edge:.3g} arcsec from its centre along x and y. Choose a larger size (--size)"
+        )
+    map_ = as_opd_map(opd)
+    pixels = model.calc_psf(opd=resample(map_.data, model.npix), star_offset=offset)["DET_SAMP"]
+    hdu = fits.PrimaryHDU(pixels.data, pixels.header)
+    del hdu.header["EXTNAME"]
+    hdu.header["BUNIT"] = ("", "fraction of the light that the pupil collects")
+    hdu.header["PUPILOPD"] = (fits_text(map_.name), "Pupil OPD source")
+    hdu.header["STAROFFX"] = (offset[0], "x of the star from the mask's centre, arcsec")
+    hdu.header["STAROFFY"] = (offset[1], "y of the star from the mask's centre, arcsec")
+    write_fits(fits.HDUList([hdu]), output)
+    click.echo(f"wrote {output}")
+
+
+@click.command(
+    "survey",
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender survey survey.toml -o products
+  pyklip-diffrender survey survey.toml -o products --scheduler tcp://host:8786""",
+)
+@click.argument("file", type=file_type())
+@option("-o", "--output", type=file_type(), required=True, metavar="FOLDER",
+        help="Folder for jobs and tables. Finished jobs are not repeated.")  # fmt: skip
+@option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler; default a local cluster.")
+@common
+@click.pass_obj
+def survey(run: Run, /, file: Path, output: Path, scheduler: str | None) -> int:
+    """Reduce many sequences, with and without injected planets, as jobs.
+
+    FILE is a TOML file with the sequences and their options. The same command goes on where an
+    earlier one was stopped.
+    """
+    from pyklip_diffrender.cli.reducing import run as run_survey
+
+    run.configured = True
+    return run_survey(file, output, scheduler, progress=run.progress)
+
+
+def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Path | None) -> bool:
+    """List the files of a programme; whether some of them would have to be fetched."""
+    from pyklip_diffrender.archive import list_calints
+
+    listing = list_calints(program, target, filter=filter, folder=cache)
+    names = ["file", "filter", "size", "access", "complete"]
+    click.echo("\n".join(listing[names].pformat(max_lines=-1, max_width=-1)))
+    missing = listing[~listing["complete"]]
+    size = missing["size"].to_value("Mbyte").sum()
+    click.echo(f"to fetch: {len(missing)} of {len(listing)} files, {size:.0f} MB")
+    return len(missing) > 0
+
+
+# The command `pyklip-diffrender learn`.
+
+_COLUMNS = ("star", "filter", "mask", "flat", "frames", "chi2_alone", "chi2_with_others", "shown")
+
+
+@click.command(
+    "learn",
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender learn calints --opd maps -o patterns/cycle1.fits
+  pyklip-diffrender learn calints --star HIP17695 --star G-7-34 --opd maps -o patterns.fits
+  pyklip-diffrender learn --program 1184 --filter F444W --opd mast -o patterns.fits
+  pyklip-diffrender reduce frames --opd maps --systematics patterns -o products""",
+)
+@click.argument("frames", type=file_type(), nargs=-1)
+@option(
+    "--star",
+    "stars",
+    multiple=True,
+    metavar="STAR",
+    section="Frames",
+    help="A star to learn from, in any spelling; may be repeated. Default: all.",
+)
+@option(
+    "--filter",
+    "filters",
+    multiple=True,
+    metavar="NAME",
+    section="Frames",
+    help="A filter to use; may be repeated. Default: all.",
+)
+@archive
+@wavefront
+@option(
+    "--size",
+    type=click.IntRange(min=8),
+    default=80,
+    show_default=True,
+    metavar="N",
+    section="Fit",
+    help="Side of the fitted square about the star, pixels.",
+)
+@outputs(file="FITS file for the library; finished fits are kept in a folder beside it.")
+@click.pass_obj
+def learn(
+    run: Run,
+    /,
+    frames: tuple[Path, ...],
+    stars: tuple[str, ...],
+    filters: tuple[str, ...],
+    program: int | None,
+    cache: Path | None,
+    opd: str,
+    opd_date: Rule | None,
+    size: int,
+    output: Path,
+    overwrite: bool,
+) -> None:
+    """Learn the flat-field pattern from the frames of many stars.
+
+    FRAMES are calints files, or folders of them, of stars without bright companions or disks; with
+    --program they come from MAST. Every star is fitted alone, and again with the pattern of the
+    others, which tells how much a pattern is worth for a star that it was not learned from. The
+    same command goes on where an earlier one was stopped.
+    """
+    require_frames(frames, program)
+    run.claim_file(output, overwrite)
+    from pyklip_diffrender.archive import fetch_calints
+    from pyklip_diffrender.cli.reducing import map_for
+    from pyklip_diffrender.io.files import without_fits_suffix
+    from pyklip_diffrender.pattern import learn_library
+
+    files = list(frames)
+    if program is not None:
+        files = fetch_calints(
+            program,
+            filter=filters[0] if len(filters) == 1 else None,
+            folder=cache,
+            progress=run.progress,
+        )
+    library = learn_library(
+        files,
+        lambda sequence: map_for(sequence, opd, opd_date),
+        stars=stars,
+        filters=filters,
+        size=size,
+        folder=output.with_name(f"{without_fits_suffix(output.name)}_fits"),
+        device=run.device,
+        progress=run.progress,
+    )
+    library.write(output, overwrite=overwrite)
+    table = library.validation
+    for name in ("chi2_alone", "chi2_with_others", "shown"):
+        table[name].info.format = ".2f"
+    click.echo("\n".join(table[list(_COLUMNS)].pformat(max_lines=-1, max_width=-1)))
+    if len(library.stars) < 2:
+        click.echo("only one star: nothing tests its pattern, and it is not used for that star")
+    click.echo(f"wrote {output}: {len(library.patterns)} frames of {', '.join(library.stars)}")
+
+
+# ``pyklip-diffrender doctor``: whether the package can work here.
+
+_LIBRARIES = (
+    "torch", "numpy", "scipy", "astropy", "poppy", "photutils", "pyklip", "matplotlib", "tqdm",
+    "click", "tomli_w",
+)  # fmt: skip
+
+_TABLES = (
+    "jwst_primary_polygons", "nircam_filters", "nircam_maskrnd_openings", "nircam_si_zernikes",
+)  # fmt: skip
+
+_NEEDED = 2e9
+"""Bytes of memory that the demo, and a reduction of one roll, take."""
+
+_PRODUCTS = 0.5e9
+"""Bytes on disk that the products of a reduction of two rolls may take."""
+
+
+_EXPLAINED = 1.5
+"""Chi-squared per pixel above which the self-test has failed; 0.8 is usual."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Outcome of one check."""
+
+    state: Literal["ok", "note", "FAIL"]
+    text: str
+
+
+def check_libraries(names: Iterable[str] = _LIBRARIES) -> Iterator[Check]:
+    """Import every library that the package needs."""
+    yield Check("ok", f"pyklip-diffrender {__version__}, Python {platform.python_version()}")
+    for name in names:
+        try:
+            import_module(name)
+            yield Check("ok", f"{name} {version(name.replace('_', '-'))}")
+        except PackageNotFoundError:
+            yield Check("note", f"{name} can be imported, and has no version")
+        except Exception as error:  # Broken libraries raise anything.
+            yield Check(
+                "FAIL",
+                f"{name} cannot be imported ({error}). Install the package again, in a fresh "
+                "environment",
+            )
+
+
+def check_data(tables: Collection[str] = _TABLES) -> Iterator[Check]:
+    """Read the files that come with the package."""
+    from pyklip_diffrender.io.files import embedded_table
+    from pyklip_diffrender.pattern.library import package_library
+
+    try:
+        rows = sum(len(embedded_table(name)) for name in tables)
+        patterns = len(package_library().patterns)
+    except (DiffrenderError, OSError, ValueError) as error:
+        yield Check("FAIL", f"data files cannot be read ({error}). Install the package again")
+    else:
+        yield Check(
+            "ok",
+            f"data files: {rows} rows in {len(tables)} tables of the instrument, {patterns} "
+            "patterns of the flat field",
+        )
+
+
+def check_stpsf() -> Iterator[Check]:
+    """Look for stpsf, which is optional, and its data."""
+    from pyklip_diffrender.io.files import read_text
+
+    try:
+        name = f"stpsf {version('stpsf')}"
+    except PackageNotFoundError:
+        yield Check("note", "stpsf is not installed; only bridges and maps from MAST need it")
+        return
+    folder = os.environ.get("STPSF_PATH") or os.environ.get("WEBBPSF_PATH")
+    if not folder:
+        yield Check("note", f"{name}; STPSF_PATH is not set, so stpsf has no data files")
+    elif not (Path(folder) / "version.txt").is_file():
+        yield Check(
+            "FAIL",
+            f"{name}; STPSF_PATH is {folder}, which has no version.txt. Set it to stpsf's data "
+            "files, or unset it",
+        )
+    else:
+        data = read_text(Path(folder) / "version.txt").strip()
+        yield Check("ok", f"{name}; STPSF_PATH is {folder}, version {data}")
+
+
+def check_machine() -> Iterator[Check]:
+    """Look at processors, memory and disk."""
+    import torch
+
+    policy = os.environ.get("OMP_WAIT_POLICY", "active")
+    yield Check(
+        "ok",
+        f"{torch.get_num_threads()} threads on {os.cpu_count()} processors, wait policy {policy} "
+        "(in Python set OMP_WAIT_POLICY=passive before PyTorch is imported)",
+    )
+    if not torch.cuda.is_available():
+        yield Check("note", "PyTorch sees no GPU; the processor is used")
+    else:
+        for k in range(torch.cuda.device_count()):
+            memory = torch.cuda.get_device_properties(k).total_memory / 1e9
+            yield Check("ok", f"cuda:{k}: {torch.cuda.get_device_name(k)}, {memory:.0f} GB")
+    yield memory_check(free_memory())
+    yield disk_check(shutil.disk_usage(Path.cwd()).free)
+
+
+def memory_check(free: float | None) -> Check:
+    """Judge so many bytes of free memory."""
+    if free is None:
+        return Check("note", "the system does not say how much memory is free")
+    text = f"{free / 1e9:.1f} GB of memory are free"
+    if free < _NEEDED:
+        return Check("FAIL", f"{text}; the demo and a reduction need 2 GB")
+    return Check("ok", text)
+
+
+def disk_check(free: float) -> Check:
+    """Judge so many free bytes on the disk."""
+    text = f"{free / 1e9:.1f} GB are free on the disk of this folder"
+    if free < _PRODUCTS:
+        return Check("FAIL", f"{text}; the products of a reduction need up to 0.5 GB")
+    return Check("ok", text)
+
+
+def check_fit(**settings: Any) -> Iterator[Check]:
+    """Simulate a telescope whose segments have moved, and refine its wavefront.
+
+    The mirror is coarsely sampled and nothing but its segments moves, so that seconds suffice.
+
+    Parameters
+    ----------
+    **settings
+        Of `GaussNewton`, besides the basis.
+    """
+    import numpy as np
+    import torch
+
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.optics.grid import PupilGrid
+    from pyklip_diffrender.refinement import GaussNewton, refine
+    from pyklip_diffrender.scene.objects import Scene
+    from pyklip_diffrender.scene.simulation import simulate
+    from pyklip_diffrender.wavefront.bases import SegmentMotions
+    from pyklip_diffrender.wavefront.opd import random_opd
+
+    began = time.perf_counter()
+    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=96, fov_pixels=24)
+    basis, measured = SegmentMotions(), random_opd(1, npix=model.npix).data
+    motions = 1e-8 * np.random.default_rng(2).normal(size=len(basis))
+    truth = measured + basis.opd(torch.from_numpy(motions), PupilGrid.full(model.npix)).numpy()
+    frame = simulate(model, Scene(), truth, seed=1)
+    fit = refine(model, frame, measured, settings=GaussNewton(basis=basis, **settings))
+    lit = model.entrance.lit.numpy()
+    before, after = (1e9 * float(np.std((opd - truth)[lit])) for opd in (measured, fit.wavefront))
+    text = (
+        f"self-test in {time.perf_counter() - began:.0f} s: the error of the wavefront fell from "
+        f"{before:.1f} to {after:.1f} nm, with chi-squared {fit.chi2_per_pixel:.2f} per pixel"
+    )
+    if fit.status.usable and after < 0.5 * before and fit.chi2_per_pixel < _EXPLAINED:
+        yield Check("ok", text)
+    else:
+        yield Check(
+            "FAIL", f"{text}, expected below {0.5 * before:.1f} nm and {_EXPLAINED}. Do not use "
+            "results of this installation; look at the versions above"
+        )  # fmt: skip
+
+
+CHECKS: tuple[Callable[[], Iterator[Check]], ...] = (
+    check_libraries,
+    check_data,
+    check_stpsf,
+    check_machine,
+    check_fit,
+)
+
+
+@click.command(cls=Command)
+@common
+@click.pass_obj
+def doctor(run: Run) -> int:
+    """Check libraries, data files, machine, and a small fit.
+
+    Takes about five seconds. The exit status is 1 if a check fails.
+    """
+    failed = 0
+    for check in CHECKS:
+        for outcome in check():
+            click.echo(f"{outcome.state:4}  {outcome.text}")
+            failed += outcome.state == "FAIL"
+    return 1 if failed else 0
+
+
+# The program: its commands, its messages and its exit status.
 
 _log = logging.getLogger(__name__)
 
@@ -37,12 +669,12 @@ def application(**_: Any) -> None:
 
 
 for _command in (
-    commands.demo,
-    commands.reduce_frames,
-    commands.detect_in_file,
+    demo,
+    reduce_frames,
+    detect_in_file,
     learn,
-    commands.survey,
-    commands.psf,
+    survey,
+    psf,
     doctor,
 ):
     application.add_command(_command)

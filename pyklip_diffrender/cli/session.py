@@ -1,4 +1,4 @@
-"""Parts of all commands: messages and the log, outputs that may be written, the device."""
+"""Parts of all commands: messages, outputs that may be written, the device, shared options."""
 
 from __future__ import annotations
 
@@ -7,16 +7,59 @@ import os
 import re
 import shutil
 import sys
+import tomllib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import click
+from click.core import ParameterSource
+
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["PROGRAM", "Run", "open_streams", "with_options"]
+__all__ = [
+    "COMMON",
+    "PROGRAM",
+    "Command",
+    "Run",
+    "archive",
+    "common",
+    "config_remark",
+    "file_type",
+    "free_memory",
+    "open_streams",
+    "option",
+    "outputs",
+    "read_config",
+    "require_frames",
+    "search",
+    "together",
+    "wavefront",
+    "with_options",
+]
+
+
+# Memory and processors that the machine has left.
+
+
+def free_memory() -> float | None:
+    """Bytes of memory that a new process could use; None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        kilobytes = next(line for line in lines if line.startswith("MemAvailable")).split()[1]
+        return 1024.0 * int(kilobytes)
+    except (OSError, StopIteration):
+        pass
+    try:
+        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+# Parts of all commands: messages and the log, outputs that may be written, the device.
 
 PROGRAM = "pyklip-diffrender"
 
@@ -297,3 +340,321 @@ def _require_device(name: str) -> None:
             f"--device: PyTorch {torch.__version__} cannot use {name!r} here, expected 'cpu', or "
             f"'cuda' with a GPU and a build for it ({str(error).splitlines()[0]})"
         ) from error
+
+
+# Options that commands share, help by section, and configuration files.
+
+Decorator = Callable[[Any], Any]
+
+_GENERAL = "General"
+
+
+class _Option(click.Option):
+    """An option that the help lists in a section."""
+
+    def __init__(self, *declarations: Any, section: str = "Options", **settings: Any) -> None:
+        super().__init__(*declarations, **settings)
+        self.section = section
+
+
+def option(*declarations: str, section: str = "Options", **settings: Any) -> Decorator:
+    """An option, by default in the first section of the help."""
+    return click.option(*declarations, cls=_Option, section=section, **settings)
+
+
+def _all(*decorators: Decorator) -> Decorator:
+    def decorated(function: Any) -> Any:
+        for decorator in reversed(decorators):
+            function = decorator(function)
+        return function
+
+    return decorated
+
+
+def file_type(**settings: Any) -> click.Path:
+    """A path of a file or folder; whether it exists is for the package to say."""
+    return click.Path(path_type=Path, **settings)
+
+
+_CONFIG = f"{__name__}.config"
+"""Key of the file of --config in the contexts of a run."""
+
+
+def config_remark() -> str:
+    """Sentence about the file that options may come from, to end a message about one of them."""
+    path = click.get_current_context().meta.get(_CONFIG)
+    return "" if path is None else f" (options are also taken from {path})"
+
+
+class _Wavefront(click.types.StringParamType):
+    """Name of a wavefront map, or a word in place of it; says what there is if it is missing."""
+
+    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:
+        return (
+            "Name the FITS file of a wavefront map or a folder of maps, say mast to fetch the map "
+            "of the date, or flat to start without one (contrasts are then uncertain by 40 %)."
+        )
+
+
+def _config_callback(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
+    if path is not None:
+        ctx.meta[_CONFIG] = path
+        ctx.default_map = {**(ctx.default_map or {}), **read_config(ctx.command, path)}
+
+
+def read_config(command: click.Command, path: Path) -> dict[str, Any]:
+    """Read the defaults for a command, or for all commands of a group, from a TOML file.
+
+    Raises
+    ------
+    click.UsageError
+        If the file cannot be read, or has an unknown option.
+    """
+    from pyklip_diffrender.io.files import read_text
+
+    try:
+        content = tomllib.loads(read_text(path))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise click.UsageError(f"--config: {path}: {error}") from error
+    general = {key: value for key, value in content.items() if not isinstance(value, Mapping)}
+    tables = {key: value for key, value in content.items() if isinstance(value, Mapping)}
+    general = _known(general, set(COMMON), f"{path}")
+    if not isinstance(command, click.Group):
+        table = tables.get(command.name or "", {})
+        return general | _known(table, _names(command), f"{path}: [{command.name}]")
+    unknown = sorted(set(tables) - set(command.commands))
+    if unknown:
+        raise click.UsageError(
+            f"--config: {path}: [{unknown[0]}] is no command, expected one of "
+            f"{', '.join(command.commands)}"
+        )
+    defaults: dict[str, Any] = dict(general)
+    for name, each in command.commands.items():
+        table = _known(tables.get(name, {}), _names(each), f"{path}: [{name}]")
+        defaults[name] = {key: v for key, v in general.items() if key in _names(each)} | table
+    return defaults
+
+
+def _names(command: click.Command) -> set[str]:
+    """Names of what a configuration file may set."""
+    names = {param.name or "" for param in command.params}
+    return names - {"config", "write_config"}
+
+
+def _known(table: Mapping[str, Any], names: set[str], where: str) -> dict[str, Any]:
+    values = {key.replace("-", "_"): value for key, value in table.items()}
+    unknown = sorted(set(values) - names)
+    if unknown:
+        raise click.UsageError(
+            f"--config: {where} has {unknown[0]!r}, which is no option. Known: "
+            f"{', '.join(sorted(name.replace('_', '-') for name in names))}"
+        )
+    return values
+
+
+def _write_config(path: Path, command: str, values: Mapping[str, Any], overwrite: bool) -> None:
+    import tomli_w
+
+    from pyklip_diffrender.io.files import replacing
+
+    if path.exists() and not overwrite:
+        raise click.UsageError(f"--write-config: {path} exists; replace it with --overwrite")
+    table = {
+        name.replace("_", "-"): _as_toml(value)
+        for name, value in values.items()
+        if value is not None
+    }
+    with replacing(path) as temporary:
+        temporary.write_text(tomli_w.dumps({command: table}), encoding="utf-8")
+
+
+def _as_toml(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_as_toml(each) for each in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+class Command(click.Command):
+    """A command with help by section, whose general options may also stand before it."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the options; messages about values of a configuration file name it."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.BadParameter as error:
+            name = "" if error.param is None else error.param.name or ""
+            if ctx.get_parameter_source(name) is ParameterSource.DEFAULT_MAP:
+                error.param_hint = f"{name.replace('_', '-')!r} in {ctx.meta.get(_CONFIG)}"
+            raise
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the sections of the options."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx)
+            # Arguments are explained in the first paragraphs.
+            if record is not None and not isinstance(param, click.Argument):
+                sections.setdefault(getattr(param, "section", _GENERAL), []).append(record)
+        # The same for all commands, so at the end.
+        sections[_GENERAL] = sections.pop(_GENERAL)
+        for name, records in sections.items():
+            with formatter.section(name):
+                formatter.write_dl(records)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Apply the general options, then run the command with its own."""
+        write_config = ctx.params.pop("write_config", None)
+        if ctx.parent is not None:
+            for name in COMMON:
+                before, own = (c.get_parameter_source(name) for c in (ctx.parent, ctx))
+                if before is ParameterSource.COMMANDLINE and own is not before:
+                    ctx.params[name] = ctx.parent.params[name]
+        if write_config is not None:
+            overwrite = ctx.params.get("overwrite", False)
+            _write_config(write_config, ctx.info_name or "", ctx.params, overwrite)
+            click.echo(f"wrote {write_config}")
+            return None
+        general = {name: ctx.params.pop(name) for name in COMMON}
+        ctx.ensure_object(Run).configure(**general)
+        return super().invoke(ctx)
+
+
+COMMON = ("verbose", "quiet", "log_file", "device", "threads")
+"""Options that may stand before the command and after it."""
+
+common = _all(
+    option("-v", "--verbose", is_flag=True, section=_GENERAL, help="Log every step of a fit."),
+    option("-q", "--quiet", is_flag=True, section=_GENERAL, help="Show no progress."),
+    option("--log-file", type=file_type(), metavar="FILE", section=_GENERAL,
+           help="Append the messages to this file, with their times."),
+    option("--device", default="cpu", show_default=True, section=_GENERAL,
+           help="PyTorch device of the optical model, such as cuda."),
+    option("--threads", type=click.IntRange(min=1), metavar="N", section=_GENERAL,
+           help="Number of threads; default: PyTorch's choice."),
+    option("--config", type=file_type(), metavar="FILE", section=_GENERAL, is_eager=True,
+           expose_value=False, callback=_config_callback,
+           help="Take defaults of the options from a TOML file."),
+)  # fmt: skip
+
+_WRITE_CONFIG = option(
+    "--write-config", type=file_type(), metavar="FILE", section=_GENERAL,
+    help="Write the options to a file for --config, and stop.",
+)  # fmt: skip
+
+_OVERWRITE = option(
+    "--overwrite", is_flag=True, section="Output",
+    help="Replace products of an earlier run.",
+)  # fmt: skip
+
+
+def outputs(default: str | None = None, *, file: str | None = None) -> Decorator:
+    """Where to write, a folder or the file that is described, and what to do if it is there."""
+    needed: dict[str, Any] = {"required": True}
+    if default is not None:
+        needed = {"default": Path(default), "show_default": True}
+    kind, help_ = "FOLDER", "Folder for the products; made if it does not exist."
+    if file is not None:
+        kind, help_ = "FILE", file
+    output = option(
+        "-o", "--output", type=file_type(), metavar=kind, section="Output", help=help_, **needed
+    )
+    return _all(output, _OVERWRITE, common, _WRITE_CONFIG)
+
+
+archive = _all(
+    option("--program", type=int, metavar="NUMBER", section="Frames",
+           help="Fetch the frames of this JWST programme from MAST, in place of FRAMES."),
+    option("--cache", type=file_type(), metavar="FOLDER", section="Frames",
+           help="Folder for fetched frames; default: in the user's cache."),
+)  # fmt: skip
+
+
+def require_frames(frames: Sequence[Path], program: int | None) -> None:
+    """Raise `click.UsageError` unless there are either files or a programme."""
+    if not frames and program is None:
+        raise click.UsageError("Missing argument 'FRAMES...', or the option --program.")
+    if frames and program is not None:
+        raise click.UsageError("Give either FRAMES or --program.")
+
+
+wavefront = _all(
+    option("--opd", required=True, type=_Wavefront(), metavar="FILE|FOLDER|flat|mast",
+           section="Wavefront map",
+           help="Wavefront map to start from: a FITS file; a folder of maps, of which one is "
+           "chosen by its date; mast for the maps of MAST, through stpsf; or flat, with which a "
+           "fit takes longer and contrasts are uncertain by 40 % unless --star-flux is given."),
+    option("--opd-date", type=click.Choice(["nearest", "before", "after", "interpolate"]),
+           section="Wavefront map",
+           help="Which map of a folder or of MAST, with respect to the frames; default: nearest."),
+)  # fmt: skip
+
+search = _all(
+    option("--size", type=click.IntRange(min=8), default=80, show_default=True, metavar="N",
+           section="Fit and search", help="Side of the fitted square about the star, pixels."),
+    option("--threshold", type=float, default=5.0, show_default=True, metavar="S/N",
+           section="Fit and search", help="S/N of a candidate."),
+    option("--wide", is_flag=True, section="Fit and search",
+           help="Search the whole frames as well, to their edge."),
+    option("--disk", is_flag=True, section="Fit and search",
+           help="Fit extended light about the star, such as a disk, together with the star."),
+    option("--injections", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
+           section="Fit and search",
+           help="Add N planets slightly brighter than the limits to the frames, and report how "
+                "well they are recovered. Seven take as long as the fit and the search."),
+    option("--completeness", is_flag=True, section="Fit and search",
+           help="Compute the fraction of planets that the search finds, by contrast and "
+                "separation. Takes a few minutes for two rolls."),
+    option("--star-flux", metavar="FLUX", section="Fit and search",
+           help='Flux density of the star in the filter, such as "0.45 Jy", to which contrasts '
+                "refer; default: what diffracted light says, to 10 %."),
+    # A path that is not converted: shells complete files, and a name stays as it is.
+    option("--star-sed", type=click.Path(), metavar="FILE", section="Fit and search",
+           help="Spectrum or photometry of the star, in place of --star-flux: two columns in "
+                "micron and Jy, a table with units, or a VOTable of VizieR's photometry viewer. "
+                'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
+    option("--star-flux-error", type=float, default=0.05, show_default=True, metavar="FRACTION",
+           section="Fit and search", help="Relative error of --star-flux, at most 1."),
+    option("--systematics", type=click.Path(), default="auto", show_default=True,
+           metavar="CHOICE", section="Fit and search",
+           help="Flat-field pattern: auto (the package's library, else the reference "
+           "stars), references (both), off, a folder or file of patterns to search besides the "
+           "package's (command learn), or a systematics.fits of an earlier reduction."),
+    option("--references", type=click.Choice(("joint", "pattern", "off")), default="joint",
+           show_default=True, section="Fit and search",
+           help="What the frames of reference stars are for: one likelihood with the target's, the "
+           "flat-field pattern, or nothing."),
+    option("--quick", is_flag=True, section="Fit and search",
+           help="A first look with a coarser model, in about two thirds of the time."),
+    option("--memory", metavar="SIZE", section="Fit and search",
+           help='Memory that the process may take, such as "2 GB"; default: as much as it needs.'),
+    option("--resume", is_flag=True, section="Output",
+           help="Go on with a reduction that was interrupted: its fit and search are kept in the "
+                "folder of the products."),
+    option("--dry-run", is_flag=True, section="Output",
+           help="Make all checks, show frames, wavefront map, steps, time and memory, and stop."),
+    option("--derivatives", is_flag=True, section="Output",
+           help="Keep the fit's derivatives in fit.fits, which then takes ten times the space: "
+           "they are needed to search the fit again."),
+    option("--figures", type=click.Choice(("pdf", "png", "svg")), section="Output",
+           help="Write every figure of the report to a file of this format, too, in the folder "
+           "figures."),
+    option("--json", is_flag=True, section="Output",
+           help="Print the content of summary.json and nothing else on standard output."),
+)  # fmt: skip
+
+together = _all(
+    option("--spectra", metavar="blackbody|flat|free|FILE", multiple=True,
+           section="Filters and epochs",
+           help="Spectra of planets for the combined search of several filters or epochs; may be "
+                "repeated: black bodies of 150 to 1,500 K, the same flux density in all filters, "
+                "any fluxes, or a table of spectra with the wavelength (micron) in the first "
+                "column. Default: blackbody, flat and free."),
+    option("--proper-motion", type=float, nargs=2, metavar="EAST NORTH",
+           section="Filters and epochs",
+           help="Proper motion of the star, arcsec per year, to tell companions from background "
+                "sources; default: that of the headers."),
+    option("--parallax", type=click.FloatRange(min=0), metavar="ARCSEC",
+           section="Filters and epochs",
+           help="Parallax of the star, for the motion of background sources and of orbits between "
+                "epochs; default: neglected."),
+)  # fmt: skip

@@ -3,10 +3,10 @@
 from pyklip_diffrender.demo.comparison import (
     DITHERS,
     DemoResult,
+    draw_demo,
     run_demo,
     simulate_references,
     write_demo,
 )
-from pyklip_diffrender.demo.demo_figure import draw_demo
 
 __all__ = ["DITHERS", "DemoResult", "draw_demo", "run_demo", "simulate_references", "write_demo"]

@@ -9,23 +9,23 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 from __future__ import annotations
 
 from pyklip_diffrender.detection import metrics
-from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.combination import combine_frames
+from pyklip_diffrender.detection.candidates import Candidates, sources_of_references
 from pyklip_diffrender.detection.combined_result import COMBINED, Combination
 from pyklip_diffrender.detection.combined_search import combine
 from pyklip_diffrender.detection.detection_file import image_hdu
-from pyklip_diffrender.detection.disk import Disk
-from pyklip_diffrender.detection.disk_fit import fit_disk
-from pyklip_diffrender.detection.figure import draw_curve
-from pyklip_diffrender.detection.motion import Hypotheses, Motion, hypotheses
-from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
-from pyklip_diffrender.detection.reference_stars import sources_of_references
+from pyklip_diffrender.detection.disk import Disk, fit_disk
+from pyklip_diffrender.detection.recovery import (
+    completeness,
+    contrast_of_completeness,
+    measured_planet,
+    recover_planets,
+    with_planets,
+)
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
-from pyklip_diffrender.detection.search_result import Detection
-from pyklip_diffrender.detection.sky_map import SkyMap
-from pyklip_diffrender.detection.true_positives import completeness, contrast_of_completeness
-from pyklip_diffrender.detection.wide_result import WideField
-from pyklip_diffrender.detection.wide_search import require_outer_pixels, wide_field
+from pyklip_diffrender.detection.search_result import Detection, draw_curve
+from pyklip_diffrender.detection.sky_map import Hypotheses, Motion, SkyMap, hypotheses
+from pyklip_diffrender.detection.templates import combine_frames
+from pyklip_diffrender.detection.wide_search import WideField, require_outer_pixels, wide_field
 
 __all__ = [
     "COMBINED",

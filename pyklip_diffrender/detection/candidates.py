@@ -1,24 +1,50 @@
-"""Point sources in refined frames, fitted together with the star marginalised."""
+"""Point sources in refined frames with the star marginalised: maps, joint fits, and errors."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image
-from pyklip_diffrender.detection.groups import Group
-from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.detection.field import Image, pixel_width
+from pyklip_diffrender.detection.templates import Group, Templates, has_only_reference_stars
+from pyklip_diffrender.io.progress import ProgressBar
+from pyklip_diffrender.linear import LinearModel, coarse_copy, downsample
+from pyklip_diffrender.linear.model import LinearFrame
+from pyklip_diffrender.linear.response import NANOMETRE
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.refinement import Refinement, refine_again, star_flux_error
 from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["Candidates", "refine_candidates"]
+__all__ = [
+    "Candidates",
+    "Maps",
+    "ReferenceSource",
+    "are_companions",
+    "calibration_errors",
+    "candidate_errors",
+    "caveats",
+    "count_rolls",
+    "in_derivatives",
+    "lacks_candidates",
+    "refine_candidates",
+    "sources_of_references",
+    "unconfirmed_companions",
+    "with_companions",
+    "with_position_of_star",
+    "without_light",
+]
+
 
 _log = logging.getLogger(__name__)
 
@@ -169,3 +195,671 @@ def refine_candidates(
     if not converged:
         _log.info("positions did not settle, number of candidates: %d", count)
     return Candidates(offsets, contrasts, covariance, detection_errors, converged)
+
+
+# Amplitude and information of a planet at every pixel, with the star marginalised.
+
+_BATCH = 320
+"""Number of templates that are rendered at a time."""
+
+_STORE = 1e9
+"""Largest number of bytes of templates that are stored; otherwise they are rendered again."""
+
+_REACH = 5
+"""Largest distance at which the autocorrelation of the S/N is computed, pixels."""
+
+_PLACES = 4
+"""Number of rows, and of columns, of places at which it is computed."""
+
+
+class Maps:
+    """Inner products with a planet p at every pixel of the first frame.
+
+    Parameters
+    ----------
+    groups : sequence of (LinearModel, Templates)
+    progress : bool
+        Show progress bars.
+
+    Attributes
+    ----------
+    numerator, information, photon : ndarray, (ny, nx)
+        p . Sigma^-1 r, p . Sigma^-1 p and p . p, see `linear.model.TemplateProducts`.
+    starlight : ndarray, (ny, nx)
+        Star over noise, averaged over the pixels with the squared S/N that a planet has in each.
+    """
+
+    def __init__(self, groups: Sequence[Group], progress: bool = False) -> None:
+        self.groups, self.progress = tuple(groups), progress
+        self.grid = self.groups[0][1].grid
+        ny, nx = self.shape = self.grid.shape[:2]
+        frames = sum(len(templates.frames) for _, templates in self.groups)
+        self._stores = 4.0 * frames * (ny * nx) ** 2 <= min(_STORE, self._spare())
+        self._stored: dict[tuple[int, int], dict[int, Tensor]] = {}
+        total, light = np.zeros((3, ny * nx)), np.zeros((2, ny * nx))
+        steps = np.linspace(0, 1, _PLACES + 2)[1:-1]
+        rows, columns = np.meshgrid((ny * steps).astype(int), (nx * steps).astype(int))
+        self._places = rows.ravel(), columns.ravel()
+        cleaned = self._cleaned(
+            [templates.at_pixels(*self._places) for _, templates in self.groups]
+        )
+        between = np.zeros((len(rows.ravel()), ny * nx))
+        for g, pixels, images in self._batches("S/N map"):
+            total[:, pixels] += torch.stack(self.groups[g][0].weigh(images)).numpy()
+            light[:, pixels] += self._starlight(g, images)
+            between[:, pixels] += _products(cleaned[g], images)
+        self._between = between.reshape(-1, ny, nx)
+        self.numerator, self.information, self.photon = total.reshape(3, ny, nx)
+        with np.errstate(invalid="ignore"):
+            self.starlight = (light[0] / light[1]).reshape(ny, nx)
+
+    def _starlight(self, g: int, images: Mapping[int, Tensor]) -> Image:
+        """Squared S/N of planets, with and without the star over noise of each pixel, (2, k)."""
+        linear, templates = self.groups[g]
+        total = np.zeros((2, len(next(iter(images.values())))))
+        for k, planets in images.items():
+            fitted, weight = templates.frames[k], linear.frames[k].weight
+            star = torch.from_numpy(fitted.star - fitted.values["background"][0])
+            squares = weight.square()
+            columns = torch.stack([squares * weight * star, squares]).flatten(1).to(planets.dtype)
+            total += (columns @ planets.flatten(1).square().T).double().numpy()
+        return total
+
+    @cached_property
+    def correlation(self) -> Image:
+        """Autocorrelation of the S/N of noise, by distance in pixels, mean over the field."""
+        side = 2 * _REACH + 1
+        total, count = np.zeros((2, side, side))
+        # Behind the mask the information is 0, and by rounding may be below it.
+        information = np.pad(np.maximum(self.information, 0.0), _REACH)
+        for row, column, products in zip(*self._places, self._between, strict=True):
+            window = np.s_[row : row + side, column : column + side]
+            size = np.sqrt(information[window] * self.information[row, column].clip(0.0))
+            total += np.divide(
+                np.pad(products, _REACH)[window], size, out=np.zeros_like(size), where=size > 0
+            )
+            count += size > 0
+        return np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+
+    def _spare(self) -> float:
+        """Bytes that the settings of the fits leave beside the linear models."""
+        models = sum(
+            4.0 * frame.jacobian.numel() for linear, _ in self.groups for frame in linear.frames
+        )
+        return min(each.fit.settings.memory_beside(models) for _, each in self.groups)
+
+    def _batches(self, name: str) -> Iterator[tuple[int, slice, dict[int, Tensor]]]:
+        """Index of the group, flat indices of pixels, and their templates by frame."""
+        ny, nx = self.shape
+        pixels = ny * nx * len(self.groups)
+        with ProgressBar(name, pixels, shown=self.progress) as progress_bar:
+            for g, (_, templates) in enumerate(self.groups):
+                for start in range(0, ny * nx, _BATCH):
+                    index = np.arange(start, min(start + _BATCH, ny * nx))
+                    images = self._stored.get((g, start))
+                    if images is None:
+                        images = templates.at_pixels(*np.divmod(index, nx))
+                        if self._stores:
+                            self._stored[g, start] = images
+                    yield g, slice(start, start + len(index)), images
+                    progress_bar.update(len(index))
+
+    def without(self, candidates: Candidates) -> Image:
+        """The numerator after candidates are removed from the data, (ny, nx)."""
+        if not len(candidates):
+            return self.numerator
+        light = [candidates.light(templates) for _, templates in self.groups]
+        return np.asarray(self.numerator - self.change(light)[0])
+
+    def response(self, offsets: Tensor) -> Image:
+        """Change of the numerator by a planet of contrast 1 at each position, (k, ny, nx).
+
+        Parameters
+        ----------
+        offsets : Tensor, (k, 2), float64
+            x, y from the star, arcsec.
+        """
+        return self.change([templates.at(offsets) for _, templates in self.groups])
+
+    def change(self, light: Sequence[Mapping[int, Tensor]]) -> Image:
+        """Change of the numerator by images that are added to the data, (k, ny, nx).
+
+        Parameters
+        ----------
+        light : sequence of mapping of int to Tensor, (k, ny, nx)
+            Images by frame, for each group.
+        """
+        cleaned = self._cleaned(light)
+        ny, nx = self.shape
+        total = np.zeros((len(cleaned[0][0]), ny * nx))
+        for g, pixels, images in self._batches("candidates"):
+            total[:, pixels] += _products(cleaned[g], images)
+        return total.reshape(-1, ny, nx)
+
+    def _cleaned(self, light: Sequence[Mapping[int, Tensor]]) -> list[dict[int, Tensor]]:
+        """C^-1 of the parts of images that the unknowns cannot reproduce, by group and frame."""
+        return [
+            {k: linear.frames[k].weight * image for k, image in linear.clean(part).items()}
+            for (linear, _), part in zip(self.groups, light, strict=True)
+        ]
+
+    def snr(self, numerator: Image | None = None) -> Image:
+        """Amplitude over its standard deviation; NaN where there is no information."""
+        information = np.where(self.information > 0, self.information, np.nan)
+        return (self.numerator if numerator is None else numerator) / np.sqrt(information)
+
+
+def _products(cleaned: Mapping[int, Tensor], planets: Mapping[int, Tensor]) -> Image:
+    """Inner products of images with planets, summed over the frames, (images, planets)."""
+    total = torch.tensor(0.0, dtype=torch.float64)
+    for k, images in planets.items():
+        total = total + (cleaned[k].float().flatten(1) @ images.flatten(1).T).double()
+    return np.asarray(total.numpy())
+
+
+# Refinement of the star with bright sources in the model, or subtracted from the data.
+
+_NEAR = 0.25
+"""lambda/D between a companion of a fit and a candidate that are the same source. Positions of
+sources above the threshold are known to a tenth of it."""
+
+_SIMILAR = 0.1
+_SIGMAS = 5.0
+"""Relative difference of their contrasts, and in standard deviations of that of the companion,
+beyond which the fit has not found the source."""
+
+
+def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool:
+    """Return True if the companions of a fit of the target are not the candidates.
+
+    They are if every companion is at the place of one candidate and about as bright, and the other
+    way round.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    candidates : Candidates
+        Positions refer to the first frame of the first fit.
+    """
+    return any(
+        len(fit.companions) != len(candidates) or bool((~_confirmed(fit, fits, candidates)).any())
+        for fit in fits
+        if not has_only_reference_stars(fit)
+    )
+
+
+def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
+    """Which sources are companions whose light counts in the derivatives of a fit, (k,).
+
+    Errors of such a source from the linear model contain those of the star and of the source's
+    image already.
+
+    Parameters
+    ----------
+    templates : Templates
+    offsets : Tensor, (k, 2)
+        x, y of the sources from the star, arcsec.
+    """
+    fit = templates.fit
+    first = fit.frames[0].observation
+    places = torch.from_numpy(first.turned(offsets.numpy(), templates.origin.observation))
+    companions = torch.from_numpy(fit.bright_companions[:, 1:])
+    return (torch.cdist(places, companions) < _NEAR * fit.model.resolution).any(dim=1)
+
+
+def unconfirmed_companions(
+    fits: Sequence[Refinement], candidates: Candidates
+) -> NDArray[np.float64]:
+    """Companions of the fits of the target that are none of the candidates.
+
+    They are most often errors of the star, which was fitted together with them.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    candidates : Candidates
+        Positions refer to the first frame of the first fit.
+
+    Returns
+    -------
+    ndarray, (k, 3)
+        Contrast, and x and y from the star in the first frame of their fit, arcsec.
+    """
+    parts = [
+        fit.companions[~_confirmed(fit, fits, candidates)]
+        for fit in fits
+        if not has_only_reference_stars(fit)
+    ]
+    return np.concatenate([np.zeros((0, 3)), *parts])
+
+
+def _confirmed(
+    fit: Refinement, fits: Sequence[Refinement], candidates: Candidates
+) -> NDArray[np.bool_]:
+    """Which companions of a fit are candidates, (companions,)."""
+    roll = fit.frames[0].observation.roll_from(fits[0].frames[0].observation)
+    places = np.array([planet.offset for planet in candidates.planets(roll)]).reshape(1, -1, 2)
+    contrasts = candidates.contrasts.numpy()
+    near = np.hypot(*np.moveaxis(fit.companions[:, None, 1:] - places, -1, 0))
+    difference = np.abs(fit.companions[:, None, 0] - contrasts)
+    allowed = np.hypot(_SIMILAR * contrasts, _SIGMAS * fit.companion_errors[:, None, 0])
+    same = (near < _NEAR * fit.model.resolution) & (difference < allowed)
+    return np.asarray(same.any(axis=1))
+
+
+def are_companions(fit: Refinement, candidates: Candidates) -> NDArray[np.bool_]:
+    """Which candidates are at the place of a companion of the fit, (candidates,)."""
+    away = candidates.offsets.numpy()[:, None] - fit.companions[None, :, 1:]
+    near = np.hypot(*np.moveaxis(away, -1, 0)) < _NEAR * fit.model.resolution
+    return np.asarray(near.any(axis=1))
+
+
+def with_companions(
+    fits: Sequence[Refinement], candidates: Candidates, progress: bool = False
+) -> list[Refinement]:
+    """Refine all fits of the target again, with the candidates as companions of the star.
+
+    Without parameters of its own, a bright companion biases the fitted wavefront beyond the range
+    of the linear model.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    candidates : Candidates
+        Positions refer to the first frame of the first fit.
+    progress : bool
+        Show progress bars.
+    """
+    origin = fits[0].frames[0].observation
+    refined = []
+    for fit in fits:
+        if not has_only_reference_stars(fit):
+            # Companions of a fit have the orientation of its own first frame.
+            roll = fit.frames[0].observation.roll_from(origin)
+            again = refine_again(fit, companions=candidates.planets(roll), progress=progress)
+            fit = replace(again, seconds=fit.seconds + again.seconds)
+        refined.append(fit)
+    return refined
+
+
+def without_light(
+    fit: Refinement, light: Mapping[int, Image], original: Sequence[Observation] | None = None
+) -> Refinement:
+    """Refine the star again after light is subtracted from the data, without companions.
+
+    The errors of the data still contain the photon noise of that light.
+
+    Parameters
+    ----------
+    fit : Refinement
+    light : mapping of int to ndarray, (ny, nx)
+        By frame.
+    original : sequence of Observation, optional
+        The frames from which it is subtracted; default those of the fit.
+    """
+    observations = original or [frame.observation for frame in fit.frames]
+    frames = [
+        replace(frame, observation=replace(observation, data=observation.data - light.get(k, 0.0)))
+        for k, (frame, observation) in enumerate(zip(fit.frames, observations, strict=True))
+    ]
+    return refine_again(replace(fit, frames=tuple(frames)), companions=())
+
+
+# Errors of candidates' positions because the star is hidden behind the mask.
+#
+# Positions are measured from the star. Where it is on the detector follows from its diffracted
+# light, together with the wavefront. With unknowns u of the star, and the offset o of a source,
+#
+#     do = (B C^-1 B^T)^-1 B C^-1 dI/du du
+#
+# is the error of the offset for an error du, where I is the image of the source and B has its
+# derivatives by flux, x and y, in all frames. The covariance of the offsets is that of the
+# unknowns, propagated.
+
+_STEP = 2e-3
+"""arcsec between images whose difference is a derivative, in single precision."""
+
+
+def with_position_of_star(
+    groups: Sequence[Group], candidates: Candidates, place: Tensor | None = None
+) -> Candidates:
+    """Add the error of the star's position to the covariance of candidates' positions.
+
+    The star's unknowns and the noise in the candidates' pixels are taken as independent. Errors of
+    a companion whose light counts in the derivatives by the star's unknowns contain that of the
+    star already, and do not change.
+
+    Parameters
+    ----------
+    groups : sequence of (LinearModel, Templates)
+    candidates : Candidates
+    place : Tensor, (2,), optional
+        x, y from the star, arcsec, at which displacements are computed for all candidates. Default
+        their own positions, which must be on the frames.
+
+    Returns
+    -------
+    Candidates
+    """
+    count = len(candidates)
+    if not count:
+        return candidates
+    places = candidates.offsets if place is None else place[None]
+    rates = [_rates(groups, each) for each in places]
+    covariance = candidates.covariance.clone()
+    for k, (_, templates) in enumerate(groups):
+        changes = torch.stack([each[k] for each in rates], dim=2).expand(-1, -1, count)
+        changes = torch.where(in_derivatives(templates, candidates.offsets), 0.0, changes)
+        # A companion whose place is not known says nothing about that of the star.
+        linear = templates.fit.linear
+        of_star = torch.tensor([each.name != "companions" for each in linear.unknowns])
+        combinations = torch.zeros(len(of_star), 2 * count, dtype=torch.float64)
+        combinations[of_star] = changes.flatten(1)
+        covariance[count:, count:] += linear.covariances(combinations)
+    return replace(candidates, covariance=covariance)
+
+
+def _rates(groups: Sequence[Group], offset: Tensor) -> list[Tensor]:
+    """Change of a measured offset by the unknowns of each group, (unknowns, 2), in arcsec."""
+    matrix = torch.zeros(3, 3, dtype=torch.float64)
+    gradients = []
+    for linear, templates in groups:
+        gradient = torch.zeros(len(linear.vector), 3, dtype=torch.float64)
+        for k in templates.frames:
+            of_frame, by_row = _offset_products(linear, templates, k, offset)
+            matrix += of_frame
+            gradient += linear.frames[k].onto_unknowns(by_row, len(gradient))
+        gradients.append(gradient)
+    return [torch.linalg.solve(matrix, gradient.T)[1:].T for gradient in gradients]
+
+
+def _offset_products(
+    linear: LinearModel, templates: Templates, k: int, offset: Tensor
+) -> tuple[Tensor, Tensor]:
+    """B C^-1 B^T, (3, 3), of a source in one frame, and B C^-1 dI/du by row, (rows, 3)."""
+    frame, fitted = linear.frames[k], templates.frames[k]
+    model = coarse_copy(fitted.model)
+    # Shifts hardly depend on the wavelength.
+    model = model.at_wavelengths(model.bandpass.thinned(1)[1])
+    opd = downsample(torch.from_numpy(fitted.opd.copy()), model.npix)
+    grid = PupilGrid.full(model.npix, model.diameter)
+    names = [linear.unknowns[unknown].name for unknown in frame.rows[: frame.first_mode].tolist()]
+
+    def image(change: Tensor, moved: Tensor | float = 0.0) -> Tensor:
+        values = fitted.optical_values
+        values["star_offset"] = templates.place_of(k, offset + moved)
+        for name in values.keys() & set(names):
+            rows = [row for row, each in enumerate(names) if each == name]
+            values[name] = values[name] + change[rows]
+        modes = change[frame.first_mode :] * NANOMETRE
+        wavefront = templates.fit.basis.opd(modes, grid) if len(modes) else 0.0
+        return fitted.flux * model(opd + wavefront, **values).double()
+
+    change = torch.zeros(len(frame.rows), dtype=torch.float64, requires_grad=True)
+    source = image(change)
+    with torch.no_grad():
+        steps = _STEP * torch.eye(2, dtype=torch.float64)
+        slopes = [(image(change, s) - image(change, -s)) / (2 * _STEP) for s in steps]
+        columns = torch.stack([source.detach(), *slopes])
+        weighted = columns * frame.weight.to(columns.device) ** 2
+        matrix = torch.tensordot(weighted, columns, dims=[[1, 2], [1, 2]])
+    # Products that do not depend on any row have derivatives as well.
+    products = torch.tensordot(weighted, source, dims=2).cpu() + 0.0 * change.sum()
+    by_row = [torch.autograd.grad(each, change, retain_graph=True)[0] for each in products]
+    return matrix.cpu(), torch.stack(by_row, dim=1)
+
+
+# Calibration errors of contrasts, from the star's flux and from the image of the source.
+
+_CLEAR = 25.0
+"""S/N above which the error of a source's own image matters."""
+
+
+def candidate_errors(
+    groups: Sequence[Group], candidates: Candidates, factor: ErrorFactor
+) -> NDArray[np.float64]:
+    """Relative calibration errors of candidates, (2, k), see `calibration_errors`."""
+    factors = torch.from_numpy(factor.of(candidates.offsets))
+    snr = torch.from_numpy(candidates.snr(factor))
+    return calibration_errors(groups, candidates.offsets, snr, factors).numpy()
+
+
+def calibration_errors(
+    groups: Sequence[Group], offsets: Tensor, snr: Tensor, factors: Tensor
+) -> Tensor:
+    """Relative errors of contrasts because of the star's flux and of the source's image.
+
+    A contrast is the flux of the source over that of the star. The source is measured with an
+    image that depends on the wavefront, so errors of the wavefront and of the star's flux change
+    the contrast in proportion. They do not change the significance of a source. Both come from
+    the same posterior and may partly cancel. In real frames the posterior understates the error of
+    the star's flux, see `star_flux_error`, which is added. Errors of a companion whose light counts
+    in the derivatives by the star's unknowns contain the posterior's already; only this is added.
+
+    Parameters
+    ----------
+    groups : sequence of (LinearModel, Templates)
+    offsets : Tensor, (k, 2)
+        x, y of the sources from the star, arcsec.
+    snr : Tensor, (k,)
+        S/N of the sources. Below 25 the image is taken as known, because noise dominates.
+    factors : Tensor, (k,)
+        By which errors of the posterior are multiplied.
+
+    Returns
+    -------
+    Tensor, (2, k), float64
+        Relative errors of the contrasts, and of the sources' own fluxes, which do not depend on the
+        star's.
+    """
+    count = len(offsets)
+    frames = sum(len(templates.frames) for _, templates in groups)
+    variance = torch.zeros(2 * count, dtype=torch.float64)
+    for linear, templates in groups:
+        changes = torch.zeros(len(linear.vector), 2 * count, dtype=torch.float64)
+        contained = in_derivatives(templates, offsets)
+        for k, fitted in templates.frames.items():
+            frame = linear.frames[k]
+            on_rows = torch.zeros(len(frame.rows), 2 * count, dtype=torch.float64)
+            for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
+                if linear.unknowns[unknown].name == "flux":
+                    on_rows[row, :count] = 1 / fitted.flux
+            for j in torch.nonzero((snr > _CLEAR) & ~contained).flatten().tolist():
+                by_modes = _by_modes(templates, k, frame, offsets[j])
+                on_rows[frame.first_mode :, [j, count + j]] = by_modes[:, None]
+            on_rows[:, contained.repeat(2)] = 0.0
+            changes += frame.onto_unknowns(on_rows, len(linear.vector)) / frames
+        variance += linear.variances(changes)
+    errors = factors * variance.sqrt().reshape(2, count)
+    untied = sum(star_flux_error(templates.fit) for _, templates in groups) / len(groups)
+    return torch.stack([torch.hypot(errors[0], torch.full_like(errors[0], untied)), errors[1]])
+
+
+def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) -> Tensor:
+    """Relative change, per nm of every mode, of the flux that a matched filter measures."""
+    modes = torch.zeros(len(frame.rows) - frame.first_mode, dtype=torch.float64)
+    if not len(modes):
+        return modes  # The wavefront was not fitted.
+    modes.requires_grad_()
+    model, basis = templates.frames[k].model, templates.fit.basis
+    grid = PupilGrid.full(model.npix, model.diameter)
+    image = templates.image(k, offset, basis.opd(modes * NANOMETRE, grid))
+    weighted = image.detach() * frame.weight.to(image.device) ** 2
+    share = (weighted * image).sum() / (weighted * image.detach()).sum()
+    return torch.autograd.grad(share, modes)[0]
+
+
+# Caveats about the candidates of a search.
+
+
+def count_rolls(fits: Sequence[Refinement]) -> int:
+    """Number of orientations of the target's frames that differ by more than a degree."""
+    angles = sorted(
+        each.observation.position_angle
+        for fit in fits
+        for each in fit.frames
+        if not each.observation.reference
+    )
+    steps = np.diff(angles, append=angles[0] + 360)
+    return max(1, int((steps > 1).sum()))
+
+
+def caveats(detection: Any) -> str:
+    """Sources that only the fit of a `Detection` has, and what a single roll cannot tell."""
+    fits = detection.fits
+    sources = unconfirmed_companions(fits, detection.sources) if fits else ()
+    remarks = [
+        f"A possible source of contrast {contrast:.1e} at {math.hypot(x, y):.2f} arcsec was "
+        "fitted with the star; the search does not confirm it."
+        for contrast, x, y in sources
+    ]
+    if detection.rolls == 1 and detection.observation.is_nircam:
+        step = np.rad2deg(detection.contrast_curve.meta["resolution_arcsec"])
+        remarks.append(
+            "One roll: structure that is fixed on the detector cannot be told from a planet. A "
+            f"second roll by 10 degrees would tell them apart beyond {step / 10:.1f} arcsec, where "
+            "it moves a planet by more than lambda/D."
+        )
+    return " ".join(remarks)
+
+
+# Point sources beside reference stars that were fitted together with a target.
+
+_THRESHOLD = 6.0
+"""S/N above which a peak is a source. Fainter ones leave less than a fifth of it in the target."""
+
+_WORTH_A_LOOK = 4.5
+"""The same for an approximate S/N, in units of its scatter."""
+
+_SAME_ROLL = 1.0
+"""Degrees between frames whose sources are at the same pixels."""
+
+_INNER = 0.3
+"""Smallest separation, arcsec. Nearer to the star, a source is taken up by the wavefront."""
+
+_SPACING = 2
+"""Pixels between the positions that are looked at: about lambda/D in the long-wave channel. Between
+four of them a source keeps 0.7 of its S/N."""
+
+_STEPS = 6
+"""Largest number of steps of its position."""
+
+
+class ReferenceSource(NamedTuple):
+    """A point source beside a reference star, in one frame.
+
+    Attributes
+    ----------
+    contrast : float
+        To its star.
+    offset : tuple of float
+        x, y from the star, arcsec.
+    light : ndarray, (ny, nx)
+        Its image, in the unit of the frame.
+    """
+
+    contrast: float
+    offset: tuple[float, float]
+    light: NDArray[np.float64]
+
+
+def sources_of_references(fit: Refinement) -> dict[int, ReferenceSource]:
+    """Find the most significant point source beside each reference star of a fit.
+
+    A source beside a reference star leaves a dark spot in the residual of the target, at the same
+    pixels of the detector.
+
+    Parameters
+    ----------
+    fit : Refinement
+        Of target and reference stars together.
+
+    Returns
+    -------
+    dict of int to ReferenceSource
+        By the frame's place in the fit, for all frames of the stars that have one.
+    """
+    stars: dict[str, list[int]] = {}
+    for k, frame in enumerate(fit.frames):
+        if frame.observation.reference:
+            stars.setdefault(frame.observation.target, []).append(k)
+    sources = {}
+    for star, places in stars.items():
+        templates = _templates_of(fit, places)
+        brightest = _brightest_source(fit, templates, places)
+        if brightest is None:
+            continue
+        contrast, x, y, snr = brightest
+        _log.info("%s has a source of S/N %.1f at x, y = %.2f, %.2f arcsec", star, snr, x, y)
+        offset = np.array([[x, y]])
+        images = templates.at(torch.from_numpy(offset))
+        origin = fit.frames[places[0]].observation
+        for k in places:
+            ((turned_x, turned_y),) = fit.frames[k].observation.turned(offset, origin)
+            sources[k] = ReferenceSource(
+                contrast, (float(turned_x), float(turned_y)), contrast * images[k][0].numpy()
+            )
+    return sources
+
+
+def _brightest_source(
+    fit: Refinement, templates: Templates, places: Sequence[int]
+) -> tuple[float, float, float, float] | None:
+    """Contrast, x, y and S/N of the most significant source in frames of one reference star."""
+    away = np.hypot(templates.grid[..., 0], templates.grid[..., 1])
+    rows, columns = (each.ravel() for each in np.indices(away.shape))
+    chosen = (away.ravel() > _INNER) & (rows % _SPACING == 0) & (columns % _SPACING == 0)
+    rows, columns = rows[chosen], columns[chosen]
+    snr = _approximate_snr(fit, places, rows, columns)
+    peak = int(snr.argmax())
+    if snr[peak] < _WORTH_A_LOOK:
+        return None
+    # The search steps over pixels, and a source may be between them.
+    group, pixel = (fit.star_only, templates), pixel_width(templates.grid)
+    row, column = rows[peak : peak + 1], columns[peak : peak + 1]
+    products = fit.star_only.weigh(templates.at_pixels(row, column))
+    contrast = (products.numerator / products.information).numpy()
+    start = Candidates.at(templates.grid[row, column], contrast)
+    source = refine_candidates([group], start, _SPACING * pixel, _STEPS)
+    measured = float(source.snr(ErrorFactor.constant(1.0))[0])
+    if measured < _THRESHOLD:
+        return None
+    x, y = source.offsets[0].tolist()
+    return float(source.contrasts[0]), x, y, measured
+
+
+def _templates_of(fit: Refinement, places: Sequence[int]) -> Templates:
+    """Templates in some frames of a reference star, which takes the part of the target."""
+    frames = [
+        replace(frame, observation=replace(frame.observation, reference=k not in places))
+        for k, frame in enumerate(fit.frames)
+    ]
+    return Templates(replace(fit, frames=tuple(frames)), frames[places[0]])
+
+
+def _approximate_snr(
+    fit: Refinement, places: Sequence[int], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """S/N of sources at pixels of the first frame of a star, (k,), in units of its scatter.
+
+    With the residual r of all unknowns, p . Sigma^-1 r is exact, and p . C^-1 p takes the place of
+    p . Sigma^-1 p, which differs from it by a factor that varies slowly over the field. Dithers
+    move the star by a fraction of a pixel, so that templates of the first frame do for all.
+    """
+    linear, first = fit.star_only, places[0]
+    templates = _templates_of(fit, [first])
+    cleaned = torch.zeros_like(linear.cleaned[first])
+    weight = torch.zeros_like(cleaned)
+    for k in places:
+        roll = fit.frames[k].observation.roll_from(fit.frames[first].observation)
+        if abs(roll) < _SAME_ROLL:
+            scale = fit.frames[k].flux / fit.frames[first].flux
+            cleaned += scale * linear.frames[k].weight * linear.cleaned[k]
+            weight += (scale * linear.frames[k].weight) ** 2
+    snr = np.zeros(len(rows))
+    for start in range(0, len(rows), _BATCH):
+        part = slice(start, start + _BATCH)
+        images = templates.at_pixels(rows[part], columns[part])[first].flatten(1).double()
+        information = images.square() @ weight.flatten()
+        snr[part] = images @ cleaned.flatten() / information.clamp(min=1e-300).sqrt()
+    return snr / max(1e-300, 1.4826 * float(np.median(np.abs(snr))))

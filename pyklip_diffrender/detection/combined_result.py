@@ -16,12 +16,15 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
-from pyklip_diffrender.detection.candidate_tables import magnitudes
-from pyklip_diffrender.detection.field import Image, separation_of
-from pyklip_diffrender.detection.motion import Hypotheses, Motion
-from pyklip_diffrender.detection.sky import Positions, deviations_and_correlation
-from pyklip_diffrender.detection.sky_map import SkyMap, SkyStack
-from pyklip_diffrender.instrument.planet_spectra import PlanetSpectra
+from pyklip_diffrender.detection.field import (
+    Image,
+    Positions,
+    deviations_and_correlation,
+    separation_of,
+)
+from pyklip_diffrender.detection.measurement import magnitudes
+from pyklip_diffrender.detection.sky_map import Hypotheses, Motion, SkyMap, SkyStack
+from pyklip_diffrender.instrument.spectrum import PlanetSpectra
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.units import to_arcsec

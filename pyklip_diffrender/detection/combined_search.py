@@ -36,33 +36,31 @@ from pyklip_diffrender.detection.combined_result import (
     unmoved,
 )
 from pyklip_diffrender.detection.field import Image, separation_of
-from pyklip_diffrender.detection.motion import (
-    POSITION,
-    YEAR,
-    Hypotheses,
-    Motion,
-    hypotheses,
-    maximum,
-    signal,
-)
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.sky_map import (
     LIGHT,
+    POSITION,
+    YEAR,
+    Family,
+    Hypotheses,
+    Motion,
     SkyMap,
     SkyStack,
     common_grid,
     date_of,
     epochs_of,
+    hypotheses,
+    level_of,
+    maximum,
+    signal,
 )
-from pyklip_diffrender.detection.trials import Family, level_of
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.planet_spectra import PlanetSpectra, planet_spectra
-from pyklip_diffrender.instrument.star_flux import star_flux_density
+from pyklip_diffrender.instrument.spectrum import PlanetSpectra, planet_spectra, star_flux_density
 from pyklip_diffrender.io.units import require_positive, to_arcsec, to_number, to_unit
 from pyklip_diffrender.refinement import Status
-from pyklip_diffrender.refinement.companions import local_maxima
-from pyklip_diffrender.scene.catalogue_star import proper_motion as motion_of
-from pyklip_diffrender.scene.catalogue_star import star_of
+from pyklip_diffrender.scene.exposure import proper_motion as motion_of
+from pyklip_diffrender.scene.exposure import star_of
+from pyklip_diffrender.scene.star_place import local_maxima
 
 __all__ = ["combine"]
 

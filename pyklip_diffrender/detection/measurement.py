@@ -1,8 +1,9 @@
-"""Measurements in the linear models of refined frames: point sources, extended ones, residuals."""
+"""Measurements in the linear models of refined frames, and their tables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,18 +11,31 @@ from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import ArrayLike
 
-from pyklip_diffrender.detection.calibration import calibration_errors
-from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.candidates import Candidates, calibration_errors, without_light
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, require_inside
-from pyklip_diffrender.detection.groups import Group, has_only_reference_stars, weigh
-from pyklip_diffrender.detection.relinearise import without_light
+from pyklip_diffrender.detection.field import (
+    Image,
+    Positions,
+    Sky,
+    deviations_and_correlation,
+    require_inside,
+)
+from pyklip_diffrender.detection.templates import Group, has_only_reference_stars, weigh
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-__all__ = ["contrasts_at", "measured_shape", "subtracted_frames"]
+__all__ = [
+    "candidate_table",
+    "contrasts_at",
+    "in_words",
+    "magnitudes",
+    "measured_shape",
+    "measured_table",
+    "subtracted_frames",
+]
+
 
 _ROUNDS = 5
 """Largest number of refinements of the star for a bright extended source."""
@@ -129,3 +143,178 @@ def _residual(frame: FrameFit) -> Image:
     """Residual of a frame of a reference star that was fitted without the target."""
     combined = frame.observation.combined()
     return np.where(combined.valid[0], combined.data[0] - frame.star, np.nan)
+
+
+# Tables of candidates and of measurements, with what they mean on the sky.
+
+Column = tuple[str, Any, Any, str, str]
+"""Name, values, unit, format and description."""
+
+_SNR = "contrast over its error for a known position, without calibration errors"
+
+_AB_ZERO = float(u.AB.to(u.Jy))
+"""Flux density of AB magnitude 0, Jy."""
+
+
+def candidate_table(
+    candidates: Candidates, factor: ErrorFactor, calibration: Image, sky: Sky
+) -> QTable:
+    """Make the table of candidates, highest S/N first; see `Detection.candidates`.
+
+    Parameters
+    ----------
+    candidates : Candidates
+    factor : ErrorFactor
+        By which their errors are multiplied.
+    calibration : ndarray, (2, k)
+        Relative calibration errors of their contrasts and of their fluxes; see
+        `calibration.calibration_errors`.
+    sky : Sky
+    """
+    count = len(candidates)
+    contrast = candidates.contrasts.numpy()
+    factors = factor.of(candidates.offsets)
+    error = factors * candidates.errors.numpy()[:, 0]
+    covariance = candidates.covariance.numpy().reshape(3, count, 3, count)
+    positions = Positions(
+        candidates.offsets.numpy(),
+        factors[:, None, None] ** 2 * np.einsum("akbk->kab", covariance)[:, 1:, 1:],
+        sky.north or 0.0,
+    )
+    separation_error, angle_error, polar = deviations_and_correlation(positions.polar_covariance)
+    x_error, y_error, _ = deviations_and_correlation(positions.covariance)
+    contrast_error = np.hypot(error, contrast * calibration[0])
+    columns: list[Column] = [
+        *_place(positions, sky),
+        *_photometry(contrast, contrast_error, np.hypot(error, contrast * calibration[1]), sky),
+        ("snr", candidates.snr(factor), None, ".1f", _SNR),
+        ("separation_error", separation_error, u.arcsec, ".4f", "standard deviation"),
+        ("position_angle_error", angle_error, u.deg, ".2f", "standard deviation"),
+        ("seppa_corr", polar, None, ".3f", "correlation of separation and position angle"),
+        *_on_sky(positions, sky),
+        *_epoch(count, sky),
+        ("frame_angle", positions.frame_angle, u.deg, ".2f",
+         "counter-clockwise from +y of the first frame; its error is that of the position angle"),
+        ("x", positions.offsets[:, 0], u.arcsec, ".4f", "from the star on the first frame"),
+        ("y", positions.offsets[:, 1], u.arcsec, ".4f", "from the star on the first frame"),
+        ("x_error", x_error, u.arcsec, ".4f", "standard deviation"),
+        ("y_error", y_error, u.arcsec, ".4f", "standard deviation"),
+    ]  # fmt: skip
+    table = _table(columns, first=("separation", "position_angle", "contrast", "snr"))
+    return table[np.argsort(-table["snr"])]
+
+
+def measured_table(raw: QTable, calibration: Image, sky: Sky, sigmas: float) -> QTable:
+    """Complete the table of contrasts at given positions; see `Detection.measure`.
+
+    Parameters
+    ----------
+    raw : QTable
+        See `measurement.contrasts_at`.
+    calibration : ndarray, (2, k)
+        As for `candidate_table`, multiplied by the factor of all errors.
+    sky : Sky
+    sigmas : float
+        S/N of a detection, below which an upper limit is stated.
+    """
+    offsets = np.stack([raw["x"].value, raw["y"].value], axis=1)
+    positions = Positions(offsets, np.zeros((len(raw), 2, 2)), sky.north or 0.0)
+    contrast, snr = (np.asarray(raw[name]) for name in ("contrast", "snr"))
+    contrast_error = np.array(raw["contrast_error"])
+    error = np.divide(contrast, snr, out=contrast_error.copy(), where=snr != 0)
+    limit = np.maximum(contrast, 0) + sigmas * contrast_error
+    limit = np.where(snr < sigmas, limit, np.nan)
+    about = f"contrast (at least 0) and {sigmas:g} errors; NaN where the S/N is {sigmas:g} or more"
+    fluxes: list[Column] = []
+    if sky.star is not None:
+        jansky = limit * sky.star[0]
+        fluxes = [("upper_limit_flux_density", jansky, u.Jy, ".3e", "of the upper limit")]
+    columns: list[Column] = [
+        ("x", raw["x"].value, u.arcsec, ".4f", "from the star on the first frame, as given"),
+        ("y", raw["y"].value, u.arcsec, ".4f", "from the star on the first frame, as given"),
+        *_photometry(contrast, contrast_error, np.hypot(error, contrast * calibration[1]), sky),
+        ("snr", snr, None, ".1f", _SNR),
+        ("upper_limit", limit, None, ".3e", about),
+        ("upper_limit_delta_mag", magnitudes(limit)[0], u.mag, ".3f", "of the upper limit"),
+        *fluxes,
+        *_epoch(len(raw), sky),
+        *_place(positions, sky),
+        *[each for each in _on_sky(positions, sky) if each[0] in ("delta_ra", "delta_dec")],
+    ]
+    table = _table(columns, first=("x", "y", "contrast", "snr", "upper_limit"))
+    table.meta["sigmas"] = sigmas
+    return table
+
+
+def in_words(table: QTable, threshold: float) -> str:
+    """A table of candidates in lines of at most 80 characters."""
+    lines = [
+        f"{row['separation'].value:7.3f} +- {row['separation_error'].value:.3f} arcsec  "
+        f"{row['position_angle'].value:6.2f} +- {row['position_angle_error'].value:.2f} deg  "
+        f"{row['contrast']:.2e} +- {row['contrast_error']:.1e}  {row['snr']:5.1f}"
+        for row in table
+    ]
+    title = "    separation             position angle     contrast               S/N"
+    return "\n".join([title, *lines] if lines else [f"no candidate above S/N {threshold:g}"])
+
+
+def magnitudes(ratio: Image, error: Image | None = None) -> tuple[Image, Image]:
+    """Magnitudes of flux ratios and their errors; NaN for ratios that are not positive."""
+    positive = np.where(ratio > 0, ratio, np.nan)
+    errors = np.zeros_like(positive) if error is None else error
+    return -2.5 * np.log10(positive), 2.5 / np.log(10) * errors / positive
+
+
+def _place(positions: Positions, sky: Sky) -> Iterator[Column]:
+    origin = "east of north" if sky.north is not None else (
+        "counter-clockwise from +y of the first frame, whose orientation is not known"
+    )  # fmt: skip
+    yield "separation", positions.separation, u.arcsec, ".4f", "from the star"
+    yield "position_angle", positions.position_angle, u.deg, ".2f", origin
+
+
+def _on_sky(positions: Positions, sky: Sky) -> Iterator[Column]:
+    if sky.north is None:
+        return
+    east, north = positions.on_sky.T
+    east_error, north_error, correlation = deviations_and_correlation(positions.sky_covariance)
+    yield "delta_ra", east, u.arcsec, ".4f", "offset to the east, dRA cos(Dec)"
+    yield "delta_ra_error", east_error, u.arcsec, ".4f", "standard deviation"
+    yield "delta_dec", north, u.arcsec, ".4f", "offset to the north"
+    yield "delta_dec_error", north_error, u.arcsec, ".4f", "standard deviation"
+    yield "radec_corr", correlation, None, ".3f", "correlation of delta_ra and delta_dec"
+
+
+def _photometry(contrast: Image, error: Image, flux_error: Image, sky: Sky) -> Iterator[Column]:
+    yield "contrast", contrast, None, ".3e", "flux over that of the star, without coronagraph"
+    yield "contrast_error", error, None, ".1e", "with those of the star's flux and the image"
+    magnitude, magnitude_error = magnitudes(contrast, error)
+    yield "delta_mag", magnitude, u.mag, ".3f", "magnitude difference to the star"
+    yield "delta_mag_error", magnitude_error, u.mag, ".3f", "standard deviation"
+    if sky.star is None:
+        return
+    jansky, jansky_error = contrast * sky.star[0], flux_error * sky.star[0]
+    yield "flux_density", jansky, u.Jy, ".3e", "in the photometric calibration of the frames"
+    yield "flux_density_error", jansky_error, u.Jy, ".1e", "without that of the calibration"
+    magnitude, magnitude_error = magnitudes(jansky / _AB_ZERO, jansky_error / _AB_ZERO)
+    yield "ab_mag", magnitude, u.mag, ".3f", "AB magnitude of flux_density"
+    yield "ab_mag_error", magnitude_error, u.mag, ".3f", "without that of the calibration"
+
+
+def _epoch(count: int, sky: Sky) -> Iterator[Column]:
+    if sky.mjd is None:
+        return
+    about = "mean mid-exposure of the target's frames, UTC"
+    yield "epoch_mjd", np.full(count, sky.mjd), None, ".5f", about
+    yield "epoch", np.full(count, sky.date, dtype="U19"), None, "", about
+
+
+def _table(columns: list[Column], first: tuple[str, ...]) -> QTable:
+    """Table of columns, some of them first: a table too wide to print loses its middle."""
+    ordered = sorted(columns, key=lambda each: first.index(each[0]) if each[0] in first else 99)
+    table = QTable()
+    for name, values, unit, form, description in ordered:
+        table[name] = values if unit is None else values * unit
+        table[name].info.format = form or None
+        table[name].info.description = description
+    return table

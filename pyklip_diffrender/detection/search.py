@@ -2,56 +2,344 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from pyklip_diffrender.detection.candidate_tables import measured_table
-from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
-from pyklip_diffrender.detection.contrast import contrast_table
-from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.error_inflation import (
-    chi2_by_ring,
-    error_inflation,
-    follows_scatter,
-    significance_of,
+from pyklip_diffrender.detection.candidates import (
+    Candidates,
+    Maps,
+    lacks_candidates,
+    refine_candidates,
+    with_companions,
+    with_position_of_star,
 )
+from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance, contrast_table
 from pyklip_diffrender.detection.field import (
     Image,
+    Sky,
     curve_separations,
     far_from,
     pixel_width,
+    reaching,
     ring_pixels,
     separation_of,
 )
-from pyklip_diffrender.detection.groups import groups_of, weigh
-from pyklip_diffrender.detection.maps import Maps
-from pyklip_diffrender.detection.measurement import contrasts_at
-from pyklip_diffrender.detection.position_errors import with_position_of_star
-from pyklip_diffrender.detection.raised_peaks import with_raised_peaks
-from pyklip_diffrender.detection.relinearise import (
-    lacks_candidates,
-    with_companions,
-)
+from pyklip_diffrender.detection.measurement import contrasts_at, measured_table
 from pyklip_diffrender.detection.search_result import Detection
-from pyklip_diffrender.detection.side_lobes import side_lobes
-from pyklip_diffrender.detection.significance import Significance
-from pyklip_diffrender.detection.sky import Sky
+from pyklip_diffrender.detection.templates import Group, groups_of, has_only_reference_stars, weigh
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import require_positive, to_arcsec
-from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.refinement import Refinement, Status
+from pyklip_diffrender.scene.star_place import local_maxima
 
-__all__ = ["contrast_curve", "detect", "measure"]
+__all__ = [
+    "chi2_by_ring",
+    "contrast_curve",
+    "default_factor",
+    "detect",
+    "error_inflation",
+    "follows_scatter",
+    "measure",
+    "side_lobes",
+    "significance_of",
+    "with_raised_peaks",
+]
+
+
+# Errors and thresholds of a search, from the residuals of its fits.
+
+_RINGS = (0.2, 0.6, 1.2, 2.0)
+"""Separations between which chi-squared is stated, arcsec."""
+
+_DEGENERATE = 1e-6
+"""Relative eigenvalue below which sources are degenerate with each other."""
+
+
+def follows_scatter(fits: Sequence[Refinement]) -> bool:
+    """Whether errors are multiplied by the scatter of the S/N, and not by chi-squared alone.
+
+    On real frames, and where a fit does not explain its data, errors of the model that neighbouring
+    pixels share do not show in chi-squared.
+    """
+    explained = all(fit.status.calibrated for fit in fits)
+    return not explained or fits[0].frames[0].observation.is_nircam
+
+
+def significance_of(
+    fits: Sequence[Refinement],
+    maps: Maps,
+    sources: Tensor,
+    inner: float,
+    scatter: float | None = None,
+) -> Significance:
+    """Errors and thresholds of the S/N maps of fits.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    maps : Maps
+    sources : Tensor, (k, 2)
+        x, y of the known sources, arcsec.
+    inner : float
+        Smallest separation of a source, arcsec.
+    scatter : float, optional
+        Replaces the factor.
+    """
+    return Significance(
+        maps.grid,
+        maps.starlight,
+        maps.correlation,
+        inner,
+        fits[0].model.resolution,
+        error_inflation(fits, maps.groups, sources) if scatter is None else scatter,
+        scatter is None and follows_scatter(fits),
+    )
+
+
+def default_factor(
+    fits: Sequence[Refinement], groups: Sequence[Group], sources: Candidates
+) -> ErrorFactor:
+    """Factor for the errors of sources that were fitted together, as in a search."""
+    if not follows_scatter(fits):
+        return ErrorFactor.constant(error_inflation(fits, groups, sources.offsets))
+    maps = Maps(groups)
+    significance = significance_of(fits, maps, sources.offsets, fits[0].model.resolution)
+    return significance.factor(maps.snr(maps.without(sources)), sources.offsets)
+
+
+def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets: Tensor) -> float:
+    """Square root of the reduced chi-squared with the light of sources removed, at least 1.
+
+    Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors. Planets
+    are not part of it: one of S/N 20 that is not removed would increase all errors by 3 %.
+    Therefore the sources are fitted together and removed first.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    groups : sequence of (LinearModel, Templates)
+        Of these fits.
+    offsets : Tensor, (k, 2)
+        x, y of the sources from the star, arcsec; some may coincide.
+
+    Returns
+    -------
+    float
+        1 if a fit does not explain its data, because its noise then includes a model error.
+    """
+    if not all(fit.status.calibrated for fit in fits):
+        return 1.0
+    reduced = float(np.mean([fit.reduced_chi2 for fit in fits]))
+    companions = Candidates.of_fit(fits[0]).offsets
+    # A ratio, because robust fits give outliers less weight in their linear models.
+    share = _reduced_chi2(groups, offsets) / _reduced_chi2(groups, companions)
+    return math.sqrt(max(1.0, reduced * share))
+
+
+def chi2_by_ring(groups: Sequence[Group], sources: Tensor, factor: ErrorFactor) -> QTable:
+    """Chi-squared per pixel of the target's frames in rings about the star, without the sources.
+
+    Parameters
+    ----------
+    groups : sequence of (LinearModel, Templates)
+    sources : Tensor, (k, 2)
+        x, y of the sources, arcsec.
+    factor : ErrorFactor
+
+    Returns
+    -------
+    QTable
+        Inner and outer separation, chi-squared per pixel, and the median error factor.
+    """
+    squares, distances = [], []
+    for (linear, templates), residuals in zip(groups, _residuals(groups, sources)[0], strict=True):
+        for k, fitted in templates.frames.items():
+            used = (linear.frames[k].weight > 0).numpy()
+            squares.append(residuals[k].numpy()[used] ** 2)
+            distances.append(separation_of(fitted.grid)[used])
+    square, distance = np.concatenate(squares), np.concatenate(distances)
+    edges = [*(each for each in _RINGS if each < distance.max()), float(distance.max())]
+    rows = []
+    for low, high in itertools.pairwise(edges):
+        ring = (distance >= low) & (distance <= high)
+        if ring.any():
+            rows.append((low, high, square[ring].mean(), float(factor.at((low + high) / 2))))
+    table = QTable(rows=rows, names=("inner", "outer", "chi2", "error_factor"), dtype=[float] * 4)
+    for name in ("inner", "outer"):
+        table[name] = np.asarray(table[name]) * u.arcsec
+    for name in table.colnames:
+        table[name].info.format = ".2f"
+    return table
+
+
+def _reduced_chi2(groups: Sequence[Group], offsets: Tensor) -> float:
+    """Reduced chi-squared of the data after the sources and all unknowns are fitted."""
+    pixels = sum(int((frame.weight > 0).sum()) for linear, _ in groups for frame in linear.frames)
+    residuals, independent = _residuals(groups, offsets)
+    chi2 = sum(float((part**2).sum()) for parts in residuals for part in parts)
+    return chi2 / max(pixels - independent, 1)
+
+
+def _residuals(groups: Sequence[Group], offsets: Tensor) -> tuple[list[list[Tensor]], int]:
+    """Whitened residuals of all frames by group, and the number of independent sources in them."""
+    if not len(offsets):
+        return [list(linear.cleaned) for linear, _ in groups], 0
+    images = [templates.at(offsets) for _, templates in groups]
+    equations = [
+        linear.normal_equations(part) for (linear, _), part in zip(groups, images, strict=True)
+    ]
+    matrix, vector = (torch.stack(parts).sum(dim=0) for parts in zip(*equations, strict=True))
+    contrasts = torch.linalg.pinv(matrix, rtol=_DEGENERATE, hermitian=True) @ vector
+    independent = int(torch.linalg.matrix_rank(matrix, rtol=_DEGENERATE, hermitian=True))
+    residuals = []
+    for (linear, _), part in zip(groups, images, strict=True):
+        light = {k: torch.tensordot(contrasts, each, dims=1)[None] for k, each in part.items()}
+        cleaned = linear.clean(light)
+        residuals.append([each - cleaned[k][0] for k, each in enumerate(linear.cleaned)])
+    return residuals, independent
+
+
+# Candidates that are side lobes of a source nearer to the star than the search goes.
+#
+# Such a source can end a fit at a wrong wavefront, whose residuals elsewhere look like planets.
+
+
+def side_lobes(
+    maps: Maps,
+    snr: Image,
+    candidates: Candidates,
+    factor: ErrorFactor,
+    threshold: float,
+    inner: float,
+) -> Tensor:
+    """Which candidates are not significant beside a source within the inner limit, (k,).
+
+    The source starts at the highest peak there, is fitted together with the candidates, and must be
+    significant beside them. A planet keeps its S/N, because the two images differ.
+
+    Parameters
+    ----------
+    maps : Maps
+    snr : ndarray, (ny, nx)
+        Without the candidates, before errors are multiplied.
+    candidates : Candidates
+    factor : ErrorFactor
+        By which the errors are multiplied.
+    threshold : float
+        S/N of a source in Gaussian noise.
+    inner : float
+        Smallest separation of candidates, arcsec.
+    """
+    none = torch.zeros(len(candidates), dtype=torch.bool)
+    if not len(candidates):
+        return none
+    scaled = np.where(separation_of(maps.grid) < inner, snr / factor.of(maps.grid), -np.inf)
+    peak = np.unravel_index(np.nanargmax(scaled), scaled.shape)
+    contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
+    both = candidates.with_one_more(maps.grid[peak], contrast)
+    both = refine_candidates(maps.groups, both, pixel_width(maps.grid) / 2)
+    sigmas = both.snr(factor)
+    # The map has less of a source between pixels, and of one that the candidates stand for.
+    if separation_of(both.offsets.numpy())[-1] >= inner or sigmas[-1] < threshold:
+        return none
+    return torch.from_numpy(sigmas[:-1] < factor.threshold(threshold, candidates.offsets))
+
+
+# Planets that have bent the wavefront of a fit so far that the search does not list them.
+#
+# A planet that is missing in the model of a fit can end it at a wrong wavefront, whose residuals
+# hide the planet and can look like another one. Such fits do not explain their data, even with the
+# candidates of a search. The highest peaks of the S/N that are left, without the factor that their
+# own scatter has raised, are then tried as companions.
+
+_log = logging.getLogger(__name__)
+
+_PEAKS = 3
+"""Largest number of peaks that are tried, each with a fit of its own."""
+
+_APART = 2.0
+"""Pixels between a candidate and a peak that is not what its subtraction left."""
+
+_LOWEST = 5.0
+"""S/N of a peak that is tried, without a factor."""
+
+_BETTER = 0.9
+"""Largest ratio of chi-squared with a companion to that without it. A planet that ends a fit at a
+wrong wavefront dominates chi-squared; errors of the model do not go away with one companion."""
+
+_UNEXPLAINED = (Status.MODEL_MISMATCH, Status.ITERATION_LIMIT)
+
+
+def with_raised_peaks(
+    fits: Sequence[Refinement],
+    maps: Maps,
+    candidates: Candidates,
+    inner: float,
+    progress: bool = False,
+) -> list[Refinement] | None:
+    """Refine the star again with the candidates and one of the highest peaks as companions.
+
+    The first one that explains the data ends the search.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    maps : Maps
+        Of these fits.
+    candidates : Candidates
+    inner : float
+        Smallest separation of a peak, arcsec.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    list of Refinement or None
+        The fits with the companion that lowers chi-squared most; None if none lowers it enough, or
+        if the fits explain their data.
+    """
+    if not _unexplained(fits):
+        return None
+    snr = maps.snr(maps.without(candidates))
+    allowed = reaching(maps.grid, inner)
+    allowed &= far_from(maps.grid, candidates.offsets, _APART * pixel_width(maps.grid))
+    best, least = None, _BETTER * _chi2(fits)
+    for peak in local_maxima(snr, allowed, _LOWEST, size=7)[:_PEAKS]:
+        contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
+        tried = candidates.with_one_more(maps.grid[peak], contrast)
+        refined = with_companions(fits, tried, progress)
+        _log.info("a companion at %s lowers chi-squared to %.3g", maps.grid[peak], _chi2(refined))
+        if all(fit.status.usable for fit in refined) and _chi2(refined) < least:
+            best, least = refined, _chi2(refined)
+            if not _unexplained(best):
+                break
+    return best
+
+
+def _unexplained(fits: Sequence[Refinement]) -> bool:
+    return any(fit.status in _UNEXPLAINED and fit.chi2_per_pixel > 1 for fit in fits)
+
+
+def _chi2(fits: Sequence[Refinement]) -> float:
+    """Mean chi-squared per pixel of the fits of the target."""
+    of_target = [fit for fit in fits if not has_only_reference_stars(fit)]
+    return float(np.mean([fit.chi2_per_pixel for fit in of_target]))
+
+
+# Search for point sources in refined frames.
 
 Fits = Refinement | Sequence[Refinement]
 
-_log = logging.getLogger(__name__)
 
 _MAX_CANDIDATES = 10
 """Largest number of candidates. More of them about one star are parts of something extended, and

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from astropy import units as u
@@ -20,35 +20,103 @@ from astropy.wcs import WCS
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection.calibration import candidate_errors
-from pyklip_diffrender.detection.candidate_tables import candidate_table, in_words, measured_table
-from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.caveats import caveats, count_rolls
+from pyklip_diffrender.detection.candidates import (
+    Candidates,
+    candidate_errors,
+    caveats,
+    count_rolls,
+)
 from pyklip_diffrender.detection.detection_file import (
     digest,
     provenance_of,
     read_detection,
     searched_fits,
+    write_astrometry,
     write_detection,
 )
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, pixels_of
-from pyklip_diffrender.detection.figure import draw_search
-from pyklip_diffrender.detection.groups import Group
+from pyklip_diffrender.detection.field import Image, Sky, pixels_of
 from pyklip_diffrender.detection.measurement import (
+    candidate_table,
     contrasts_at,
+    in_words,
     measured_shape,
+    measured_table,
     subtracted_frames,
 )
-from pyklip_diffrender.detection.orbits import write_astrometry
-from pyklip_diffrender.detection.sky import Sky
+from pyklip_diffrender.detection.templates import Group
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import ccd_data, world_coordinates
 
-__all__ = ["Detection"]
+__all__ = ["Detection", "draw_curve", "draw_search"]
+
+
+# The figure of a search: its S/N map and its contrast curve.
+
+
+class _Search(Protocol):
+    """The part of a `Detection` or a `WideField` that is drawn."""
+
+    @property
+    def snr(self) -> Image: ...
+    @property
+    def grid(self) -> Image: ...
+    @property
+    def candidates(self) -> QTable: ...
+    @property
+    def contrast_curve(self) -> QTable: ...
+    @property
+    def threshold(self) -> float: ...
+    @property
+    def error_factor(self) -> ErrorFactor: ...
+    @property
+    def observation(self) -> Observation: ...
+
+
+def draw_search(axes: Sequence[Any], search: _Search) -> None:
+    """Draw the S/N map with the candidates, and the contrast curve.
+
+    Parameters
+    ----------
+    axes : two Axes
+    search : Detection or WideField
+    """
+    table = search.candidates
+    drawing.snr_map(
+        axes[0], search.snr, search.grid,
+        np.stack([table["x"].value, table["y"].value], axis=1),
+        search.observation.north,
+        title=f"{len(table)} candidate{'' if len(table) == 1 else 's'} above "
+        f"S/N {search.threshold:g}",
+        labels=[f"S/N {each:.1f}" for each in table["snr"]],
+    )  # fmt: skip
+    draw_curve(axes[1], search)
+
+
+def draw_curve(
+    ax: Any, search: _Search, klip: QTable | None = None, *, legend_below: bool = False
+) -> None:
+    """Draw the contrast curve with the candidates.
+
+    Parameters
+    ----------
+    ax : Axes
+    search : Detection or WideField
+    klip : QTable, optional
+        Contrast curve of KLIP on the same frames, see `klip_curve`.
+    legend_below : bool
+        See `drawing.contrast_curve`.
+    """
+    drawing.contrast_curve(
+        ax, search.contrast_curve, search.candidates, small_sample=search.error_factor.is_measured,
+        klip=klip, legend_below=legend_below,
+    )  # fmt: skip
+
+
+# The result of a detection: maps, candidates and contrast curve.
 
 
 @dataclass(frozen=True)

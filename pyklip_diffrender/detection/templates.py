@@ -1,22 +1,27 @@
-"""Images of planets of contrast 1 at any position in the frames of a fit."""
+"""Images of planets of contrast 1 at any position in the frames of one fit, or of several."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.geometry import rotation_matrix
+from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.linear.model import LinearModel, TemplateProducts
 from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-__all__ = ["Templates"]
+__all__ = ["Group", "Templates", "combine_frames", "groups_of", "has_only_reference_stars", "weigh"]
+
 
 _FINE = 3
 """Positions of sources per pixel, along x and y, in frames where they are not at pixel centres. A
@@ -263,3 +268,84 @@ def _few_wavelengths(model: OpticalSystem) -> Bandpass:
 
 def _as_tensor(opd: NDArray[np.float64]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(opd))
+
+
+# Fits of one target, each with its linear model and its templates.
+#
+# The frames of a fit share unknowns, those of different fits do not. Therefore the information of
+# different groups adds.
+
+Group = tuple[LinearModel, Templates]
+
+
+def has_only_reference_stars(fit: Refinement) -> bool:
+    """Whether no frame of a fit shows the target."""
+    return all(frame.observation.reference for frame in fit.frames)
+
+
+def groups_of(fits: Sequence[Refinement]) -> list[Group]:
+    """Linear model and templates of every fit of the target."""
+    origin = fits[0].frames[0]
+    return [
+        (fit.star_only, Templates(fit, origin)) for fit in fits if not has_only_reference_stars(fit)
+    ]
+
+
+def weigh(
+    groups: Sequence[Group], render: Callable[[Templates], Mapping[int, Tensor]]
+) -> TemplateProducts:
+    """Inner products of templates with the data, summed over groups.
+
+    Parameters
+    ----------
+    groups : sequence of (LinearModel, Templates)
+    render : callable
+        Returns the templates (k, ny, nx) of a group by frame.
+    """
+    products = [linear.weigh(render(templates)) for linear, templates in groups]
+    return TemplateProducts(
+        *(torch.stack(parts).sum(dim=0) for parts in zip(*products, strict=True))
+    )
+
+
+# Frames of several rolls, turned to one orientation and averaged.
+
+
+def combine_frames(
+    templates: Templates,
+    images: Mapping[int, Image],
+    errors: Mapping[int, Image],
+    offsets: Image,
+) -> tuple[Image, Image]:
+    """Average frames, weighted by their errors, at positions about the star.
+
+    Parameters
+    ----------
+    templates : Templates
+        Of the fit, which knows where the star is in every frame.
+    images : mapping of int to ndarray, (ny, nx)
+        By frame. Invalid pixels get no weight, but cubic splines reach over them: they need finite
+        values.
+    errors : mapping of int to ndarray, (ny, nx)
+        Standard deviations; inf for invalid pixels.
+    offsets : ndarray, (rows, columns, 2)
+        Positions, x and y from the star in the first frame, arcsec.
+
+    Returns
+    -------
+    image, error : ndarray, (rows, columns)
+        NaN where no frame has a valid pixel.
+    """
+    shape = offsets.shape[:2]
+    total, weights = np.zeros((2, *shape))
+    for k, image in images.items():
+        places = templates.pixels_of(k, torch.from_numpy(offsets.reshape(-1, 2)))
+        values, weight = (
+            map_coordinates(array, places, order=order, cval=0.0).reshape(shape)
+            for array, order in ((image, 3), (errors[k] ** -2.0, 1))
+        )
+        total += weight * values
+        weights += weight
+    covered = weights > 0
+    safe = np.where(covered, weights, 1.0)
+    return np.where(covered, total / safe, np.nan), np.where(covered, safe**-0.5, np.nan)

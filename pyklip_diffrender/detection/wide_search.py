@@ -1,37 +1,574 @@
-"""Search of the whole frames, seamless with that of the pixels about the star."""
+"""Search for point sources in whole frames, far outside the pixels that a fit takes."""
 
 from __future__ import annotations
 
 import itertools
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from astropy import units as u
+from astropy.io import fits
+from astropy.stats import SigmaClip
 from astropy.table import QTable, vstack
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
-from scipy.ndimage import label, map_coordinates
+from scipy.ndimage import convolve, label, map_coordinates
 from scipy.optimize import least_squares
+from scipy.signal import fftconvolve
 from scipy.sparse.csgraph import connected_components
 
-from pyklip_diffrender.detection.candidate_tables import candidate_table
-from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.contrast import contrast_table
-from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
-from pyklip_diffrender.detection.position_errors import with_position_of_star
-from pyklip_diffrender.detection.search_result import Detection
-from pyklip_diffrender.detection.significance import Significance
-from pyklip_diffrender.detection.whole_frames import EDGE, REACH, WholeFrame
-from pyklip_diffrender.detection.wide_result import WideField
+from pyklip_diffrender import drawing
+from pyklip_diffrender.detection.candidates import Candidates, with_position_of_star
+from pyklip_diffrender.detection.detection_file import image_hdu
+from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance, contrast_table
+from pyklip_diffrender.detection.field import (
+    Image,
+    far_from,
+    pixel_width,
+    pixels_of,
+    ring_pixels,
+    separation_of,
+)
+from pyklip_diffrender.detection.measurement import candidate_table, in_words
+from pyklip_diffrender.detection.search_result import Detection, draw_curve
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.refinement import star_flux_error
+from pyklip_diffrender.io.files import require_new, write_fits, write_table
+from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.refinement import FrameFit, star_flux_error
+from pyklip_diffrender.refinement.fit_result import pixel_grid
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
-__all__ = ["require_outer_pixels", "wide_field"]
+if TYPE_CHECKING:
+    from photutils.psf import ImagePSF
+
+__all__ = ["EDGE", "REACH", "WholeFrame", "WideField", "require_outer_pixels", "wide_field"]
+
+
+# Frames beyond the pixels on which the star was fitted: background, noise, and matched filter.
+
+EDGE = 16
+"""Pixels within the last valid rows and columns that are not searched: templates are cut off there,
+and light scattered by the edge of the occulters' substrate appears in the first rows of every
+frame."""
+
+_FAR = 4.0
+"""Separation of the source whose image is taken for all sources far from the star, arcsec. The
+occulter takes less than a percent of its light."""
+
+_KERNEL = 15
+"""Side of that image in the matched filter, pixels."""
+
+REACH = 81
+"""Side of the image that is subtracted for a source: it has side lobes far from its middle."""
+
+_FINE = 4
+"""Positions per pixel, along x and y, at which it is rendered for photometry."""
+
+_BOX = 32
+"""Side of the boxes in which the background is estimated, pixels."""
+
+_CORE = 2.0
+"""arcsec; closer to the star its residual is no background."""
+
+_OUTLIER = 5.0
+"""Standard deviations by which a pixel is brighter than its neighbours allow if it is masked."""
+
+_NOT_CONVERGED = 8
+"""Flag of photutils for a fit that has not converged."""
+
+_FITTED = 9
+"""Side of the square in which a source is fitted, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class WholeFrame:
+    """A whole frame with the fitted star and the background removed.
+
+    Attributes
+    ----------
+    fit : FrameFit
+        Fit of the star in the pixels about it.
+    observation : Observation
+        The whole frame, of which the fit has a part.
+    roll : float
+        Rotation of the sky from the first frame to this one, degrees.
+    candidates : ndarray, (k, 3)
+        Contrast, and x, y from the star in the first frame, of the sources that were found in the
+        fitted pixels. They are removed as well.
+    """
+
+    fit: FrameFit
+    observation: Observation
+    roll: float
+    candidates: Image = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @cached_property
+    def grid(self) -> Image:
+        """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
+        return pixel_grid(*self.fit.on_pixels(self.observation.shape, self._center))
+
+    @property
+    def _center(self) -> tuple[float, float]:
+        x, y = self.observation.center[0]
+        return float(x), float(y)
+
+    @cached_property
+    def _bounds(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First and last column, and row, of which at least half of the pixels are valid."""
+        valid = self.observation.combined().valid[0]
+        lines = [np.flatnonzero(valid.mean(axis=axis) >= 0.5) for axis in (0, 1)]
+        columns, rows = ((int(k[0]), int(k[-1])) if len(k) else (0, -1) for k in lines)
+        return columns, rows
+
+    def searches(self, offsets: Image) -> NDArray[np.bool_]:
+        """Whether positions x, y from the star in the first frame, (..., 2), are searched."""
+        pixels = self.pixels_of(np.asarray(offsets, dtype=float))
+        # Half a pixel further, their centres are still nearest to a searched pixel.
+        inside = [
+            (pixels[..., k] >= first + EDGE - 0.5) & (pixels[..., k] <= last - EDGE + 0.5)
+            for k, (first, last) in enumerate(self._bounds)
+        ]
+        return np.asarray(inside[0] & inside[1])
+
+    @cached_property
+    def stars(self) -> Image:
+        """Image of the star and of the candidates, without background, (ny, nx)."""
+        shape, center = self.observation.shape, self._center
+        image = self.fit.render(shape, center, background=False)
+        star = self.fit.values.get("star_offset", np.zeros(2))
+        for contrast, *offset in self.candidates:
+            x, y = star + self._turn @ offset
+            image += contrast * self.fit.render(shape, center, background=False, source=(x, y))
+        return image
+
+    @cached_property
+    def residual(self) -> Image:
+        """Data without star, candidates and background, (ny, nx); 0 where masked."""
+        # Imported where it is used, because it imports matplotlib.
+        from photutils.background import Background2D, MedianBackground
+
+        combined = self.observation.combined()
+        image = np.asarray(combined.data[0] - self.stars)
+        separation = separation_of(self.grid)
+        # Of a small frame, its outer part.
+        core = min(_CORE, 0.7 * float(separation.max()))
+        unused = ~combined.valid[0] | (separation < core)
+        ground = Background2D(
+            np.where(combined.valid[0], image, 0.0),
+            _BOX,
+            mask=unused,
+            exclude_percentile=90.0,
+            sigma_clip=SigmaClip(sigma=3.0),
+            bkg_estimator=MedianBackground(),
+        ).background
+        return np.where(combined.valid[0], image - ground, 0.0)
+
+    @cached_property
+    def sigma(self) -> Image:
+        """Standard deviation of the noise, (ny, nx); inf where masked, and in outliers.
+
+        An outlier is brighter than its neighbours allow: of all positions of a source, that in the
+        middle of a pixel leaves the neighbours least of its light.
+        """
+        combined = self.observation.combined()
+        sigma = np.where(combined.valid[0], combined.error[0], np.inf)
+        middle = _KERNEL // 2
+        cross = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
+        window = (slice(middle - 1, middle + 2),) * 2
+        share = (self.kernel[window] * cross).sum() / self.kernel[middle, middle]
+        allowed = np.maximum(convolve(self.residual, cross), 0.0) / share
+        uncertain = _OUTLIER * combined.error[0] * math.sqrt(1 + 0.25 / share**2)
+        # Residuals of the star are sharper than sources, too.
+        outlier = (self.residual > allowed + uncertain) & (separation_of(self.grid) > _CORE)
+        return np.where(outlier, np.inf, sigma)
+
+    def _source(self, size: int, x: float = 0.0, y: float = 0.0) -> Image:
+        """Source of contrast 1 far from the star, x, y pixels right of and above the middle."""
+        model, values = self.fit.on_pixels(size)
+        scale = np.array(model.detector.pixelscale)
+        far = torch.tensor([_FAR, 0.0], dtype=torch.float64)
+        values["star_offset"] = far
+        values["detector_shift"] = torch.from_numpy(np.array([x, y]) * scale) - far
+        with torch.no_grad():
+            image = model(torch.from_numpy(np.ascontiguousarray(self.fit.opd)), **values)
+        return np.asarray(self.fit.flux * image.double().cpu().numpy())
+
+    @cached_property
+    def kernel(self) -> Image:
+        """Image of a source of contrast 1 in the middle of a square of pixels."""
+        return self._source(_KERNEL)
+
+    @cached_property
+    def _fine(self) -> Image:
+        """The kernel, larger and sampled more finely than the pixels."""
+        fine = np.empty((_FINE * REACH, _FINE * REACH))
+        middle = (_FINE - 1) / 2
+        for row in range(_FINE):
+            for column in range(_FINE):
+                # A pixel right of the source's middle sees what a source to its left shows.
+                moved = self._source(REACH, (middle - column) / _FINE, (middle - row) / _FINE)
+                fine[row::_FINE, column::_FINE] = moved
+        return fine
+
+    @cached_property
+    def fine_image(self) -> ImagePSF:
+        """The fine image as a model for photutils."""
+        from photutils.psf import ImagePSF
+
+        return ImagePSF(self._fine, oversampling=_FINE)
+
+    @cached_property
+    def correlation(self) -> Image:
+        """Autocorrelation of the S/N of noise, by distance in pixels."""
+        image = fftconvolve(self.kernel, self.kernel[::-1, ::-1])
+        middle, reach = _KERNEL - 1, _KERNEL // 2
+        near = slice(middle - reach, middle + reach + 1)
+        return np.asarray(image[near, near] / image[middle, middle])
+
+    @cached_property
+    def starlight(self) -> Image:
+        """Star over noise, averaged with the squared S/N that a source has in each pixel."""
+        weight, squares = self.sigma**-2.0, self.kernel[::-1, ::-1] ** 2
+        ratio = np.where(weight > 0, self.stars / self.sigma, 0.0)
+        light, total = (
+            fftconvolve(each, squares, mode="same") for each in (weight * ratio, weight)
+        )
+        return np.asarray(np.maximum(light, 0) / np.maximum(total, 1e-300))
+
+    def products(self, image: Image) -> tuple[Image, Image]:
+        """Template times image and template times template, over the variance, at every pixel.
+
+        The template's mean is removed, so that a level that is constant over it does not matter.
+        """
+        weight = self.sigma**-2.0
+        source = self.kernel[::-1, ::-1]
+        flat = np.ones_like(source)
+
+        def around(values: Image, kernel: Image) -> Image:
+            return np.asarray(fftconvolve(values, kernel, mode="same"))
+
+        total = np.maximum(around(weight, flat), 1e-300)
+        mixed = around(weight, source)
+        numerator = around(image * weight, source)
+        numerator -= around(image * weight, flat) * mixed / total
+        information = around(weight, source**2) - mixed**2 / total
+        return numerator, np.maximum(information, 0.0)
+
+    def pixels_of(self, offsets: Image) -> Image:
+        """Columns and rows, (..., 2), of positions x, y from the star in the first frame."""
+        return pixels_of(self.grid, offsets @ self._turn.T)
+
+    def offsets_of(self, pixels: Image) -> Image:
+        """x, y from the star in the first frame of columns and rows, (k, 2)."""
+        origin = self.grid[0, 0]
+        steps = np.stack([self.grid[0, 1] - origin, self.grid[1, 0] - origin], axis=1)
+        return np.asarray((origin + pixels @ steps.T) @ self._turn)
+
+    @property
+    def _turn(self) -> NDArray[np.float64]:
+        return rotation_matrix(self.roll)
+
+    def window_about(self, offset: Image, size: int) -> tuple[slice, slice]:
+        """Rows and columns of a square of pixels about x, y from the star in the first frame."""
+        middle = np.rint(self.pixels_of(offset)).astype(int)[::-1]
+        begin, end = np.maximum(middle - size // 2, 0), np.maximum(middle + size // 2 + 1, 0)
+        return slice(begin[0], end[0]), slice(begin[1], end[1])
+
+    def gaussian(self, window: tuple[slice, slice]) -> Callable[[Image, Image], Image]:
+        """Images of sources of contrast 1 with the shape of a Gaussian.
+
+        Parameters
+        ----------
+        window : (slice, slice)
+            Rows and columns of the images, see `window_about`.
+
+        Returns
+        -------
+        callable
+            Takes x, y from the star in the first frame, (2,), arcsec, and the covariance of the
+            Gaussian, (2, 2), arcsec^2 along the axes of the first frame; 0 for a point source.
+        """
+        ny, nx = self.observation.shape
+        rows, columns = np.arange(ny)[window[0]], np.arange(nx)[window[1]]
+        # Twice as wide as the window, so that its copies on all sides are not seen.
+        beyond = max(0, REACH - 2 * max(len(rows), len(columns)) - 1) // 2 * _FINE
+        fine = self._fine[beyond:-beyond, beyond:-beyond] if beyond else self._fine
+        side = len(fine)
+        # Cycles per pixel, along rows and columns.
+        ky, kx = np.fft.fftfreq(side, 1 / _FINE)[:, None], np.fft.rfftfreq(side, 1 / _FINE)
+        # The middle is between two samples.
+        middle = (side - 1) / 2 / _FINE
+        transform = np.fft.rfft2(fine) * np.exp(2j * np.pi * middle * (kx + ky))
+        origin = self.pixels_of(np.zeros(2))
+        to_pixels = (self.pixels_of(np.eye(2)) - origin).T
+
+        def image(offset: Image, covariance: Image) -> Image:
+            x, y = self.pixels_of(offset)
+            (xx, xy), (_, yy) = 2 * np.pi**2 * to_pixels @ covariance @ to_pixels.T
+            smoothed = np.exp(-(xx * kx**2 + yy * ky**2 + 2 * xy * kx * ky))
+            along_x, along_y = (
+                np.exp(-2j * np.pi * k * (place - round(place))) for k, place in ((kx, x), (ky, y))
+            )
+            moved = np.fft.irfft2(transform * smoothed * along_x * along_y, s=fine.shape)
+            samples = [_FINE * (p - round(q)) % side for p, q in ((rows, y), (columns, x))]
+            return np.asarray(moved[np.ix_(*samples)])
+
+        return image
+
+    def on_first(self, grid: Image, images: Sequence[Image]) -> list[Image]:
+        """Images of this frame at the positions of the first frame's pixels; 0 outside it.
+
+        So are they where the last of the images is not positive after the interpolation.
+        """
+        if np.array_equal(grid, self.grid):
+            return list(images)
+        x, y = np.moveaxis(self.pixels_of(grid), -1, 0)
+        moved = [map_coordinates(each, [y, x], order=3, mode="constant") for each in images]
+        return [np.where(moved[-1] > 0, each, 0.0) for each in moved]
+
+    def light(self, offsets: Image, contrasts: Image) -> Image:
+        """Image of point sources at x, y from the star in the first frame, (ny, nx)."""
+        total = np.zeros(self.observation.shape)
+        ny, nx = total.shape
+        for (x, y), contrast in zip(self.pixels_of(offsets), contrasts, strict=True):
+            half = REACH // 2
+            rows = slice(max(round(y) - half, 0), min(round(y) + half + 1, ny))
+            columns = slice(max(round(x) - half, 0), min(round(x) + half + 1, nx))
+            if rows.start < rows.stop and columns.start < columns.stop:
+                row, column = np.mgrid[rows, columns]
+                total[rows, columns] += self.fine_image.evaluate(column, row, contrast, x, y)
+        return total
+
+    def photometry(
+        self, image: Image, offset: Image, contrast: float
+    ) -> tuple[Image, Image, float] | None:
+        """Fit a point source to an image, starting from its position and contrast.
+
+        Returns
+        -------
+        values, errors : ndarray, (3,)
+            Contrast, and x, y from the star in the first frame, arcsec.
+        chi2 : float
+            Reduced chi-squared.
+        None
+            If the source is not where this frame is searched, before or after the fit, or if that
+            fails.
+        """
+        from photutils.psf import PSFPhotometry
+
+        x, y = self.pixels_of(offset)
+        if not self.searches(offset) or np.isinf(self.sigma[round(y), round(x)]):
+            return None
+        start = QTable({"x": [x], "y": [y], "flux": [contrast]})
+        unused = np.isinf(self.sigma)
+        with warnings.catch_warnings():
+            # Of a fit that has not converged, which its flags say as well.
+            warnings.simplefilter("ignore", AstropyUserWarning)
+            fitted = PSFPhotometry(self.fine_image, (_FITTED, _FITTED))(
+                image, error=np.where(unused, 1.0, self.sigma), mask=unused, init_params=start
+            )[0]
+        if fitted["flags"] & _NOT_CONVERGED:
+            return None
+        place = self.offsets_of(np.array([fitted["x_fit"], fitted["y_fit"]], dtype=float))
+        values = np.array([fitted["flux_fit"], *place], dtype=float)
+        scale = self.fit.model.detector.pixelscale
+        variances = np.array([fitted["x_err"], fitted["y_err"]], dtype=float) ** 2
+        # Along the axes of the first frame, from which this one may be rolled.
+        turned = self._turn.T**2 @ (variances * np.square(scale))
+        errors = np.array([fitted["flux_err"], *np.sqrt(turned)], dtype=float)
+        usable = np.isfinite(values).all() and (errors > 0).all() and self.searches(place)
+        return (values, errors, float(fitted["reduced_chi2"])) if usable else None
+
+
+# The result of a search of whole frames.
+
+
+@dataclass(frozen=True, eq=False)
+class WideField:
+    """Sources in whole frames.
+
+    About the star the maps are those of the `Detection`, with the star marginalised. Elsewhere
+    they are those of a matched filter on the frames without the star, extrapolated from its fit,
+    and without the background. Images have the first frame's pixels.
+
+    Attributes
+    ----------
+    detection : Detection
+        The search of the pixels about the star.
+    threshold : float
+        Smallest S/N of a candidate.
+    contrast, error, snr : ndarray, (ny, nx)
+        As those of `Detection`; NaN where nothing is known.
+    grid : ndarray, (ny, nx, 2)
+        x, y of the pixels from the star, arcsec.
+    error_factor : ErrorFactor
+        Factor by which errors outside the fitted pixels were multiplied.
+    candidates : QTable
+        Candidates, highest S/N first, those of the detection included; columns as in
+        `Detection.candidates`, and fit_chi2, shape, fwhm_major, fwhm_minor and axis_angle. An
+        extended source, or several that are blended, are one row with the contrast of all of its
+        light.
+    contrast_curve : QTable
+        See `contrast.contrast_table`.
+    light : tuple of ndarray, (ny, nx)
+        Light of the sources outside the fitted pixels in every frame, in the data's unit.
+
+    Examples
+    --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", wide=True)  # doctest: +SKIP
+    >>> print(result.wide)  # doctest: +SKIP
+    """
+
+    detection: Detection
+    threshold: float
+    contrast: Image
+    error: Image
+    snr: Image
+    grid: Image
+    error_factor: ErrorFactor
+    candidates: QTable
+    contrast_curve: QTable
+    light: tuple[Image, ...] = ()
+
+    def __repr__(self) -> str:
+        ny, nx = self.snr.shape
+        return f"<WideField: {nx} x {ny} pixels, {len(self.candidates)} candidates>"
+
+    def __str__(self) -> str:
+        """The candidates in words, at most 80 columns wide."""
+        return in_words(self.candidates, self.threshold)
+
+    def _repr_html_(self) -> str:
+        ny, nx = self.snr.shape
+        facts = {"Star": self.observation.target, "Pixels": f"{nx} x {ny}"}
+        title = f"WideField: {len(self.candidates)} candidates above {self.threshold:g} sigma"
+        columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "shape")
+        return html_summary(title, facts, self.candidates, columns)
+
+    @property
+    def observation(self) -> Observation:
+        """The first frame, as far as it was fitted."""
+        return self.detection.observation
+
+    @property
+    def north(self) -> float:
+        """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
+        return self.detection.north
+
+    def subtracted(
+        self, whole: Sequence[Observation], cut: Sequence[Observation]
+    ) -> tuple[Observation, ...] | None:
+        """The fitted pixels without the light of sources outside them.
+
+        Parameters
+        ----------
+        whole, cut : sequence of Observation
+            All frames, and the cutouts that were fitted.
+
+        Returns
+        -------
+        tuple of Observation or None
+            None if there is too little of that light to be seen.
+        """
+        cleaned, seen = [], 0.0
+        for light, frame, part in zip(self.light, whole, cut, strict=True):
+            column, row = np.rint(frame.center[0] - part.center[0]).astype(int)
+            ny, nx = part.shape
+            inside = light[row : row + ny, column : column + nx]
+            combined = part.combined()
+            ratio = np.where(combined.valid[0], inside / combined.error[0], 0.0)
+            seen = max(seen, float(np.sqrt((ratio**2).sum())))
+            cleaned.append(replace(part, data=part.data - inside))
+        return tuple(cleaned) if seen > self.threshold else None
+
+    def plot(self, ax: Any = None) -> NDArray[Any]:
+        """Draw the S/N map with the candidates, and the contrast curve.
+
+        North is up, or +y of the first frame where its orientation is not known. The candidates are
+        numbered as in the table.
+
+        Parameters
+        ----------
+        ax : two Axes, optional
+            Default those of a new figure.
+
+        Returns
+        -------
+        ndarray of Axes, (2,)
+        """
+        axes = drawing.axes_for(ax, 2)
+        grid, to_sky = self._sky_grid()
+        columns, rows = np.moveaxis(pixels_of(self.grid, grid @ to_sky), -1, 0)
+        snr = map_coordinates(self.snr, [rows, columns], order=1, cval=np.nan)
+        table = self.candidates
+        count = len(table)
+        drawing.snr_map(
+            axes[0], snr, grid,
+            np.stack([table["x"].value, table["y"].value], axis=1) @ to_sky.T,
+            None if self.observation.position_angles is None else 0.0,
+            title=f"{count} candidate{'' if count == 1 else 's'} above S/N {self.threshold:g}",
+            labels=[str(k) for k in range(1, count + 1)],
+        )  # fmt: skip
+        draw_curve(axes[1], self)
+        return np.array(axes)
+
+    def _sky_grid(self) -> tuple[Image, Image]:
+        """x, y of pixels from the star with north up, (n, m, 2), and the rotation to them."""
+        to_sky = rotation_matrix(self.north)
+        edges = self.grid[[0, 0, -1, -1], [0, -1, 0, -1]] @ to_sky.T
+        step = pixel_width(self.grid)
+        low, high = np.floor(edges.min(axis=0) / step), np.ceil(edges.max(axis=0) / step)
+        x, y = (step * np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
+        return np.stack(np.meshgrid(x, y), axis=-1), to_sky
+
+    def write(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> list[Path]:
+        """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables.
+
+        Raises
+        ------
+        ExistingFileError
+            If one of the files exists, and `overwrite` is False; it is also an `OSError`.
+        """
+        folder = Path(folder)
+        tables = {
+            folder / "wide_field_candidates.ecsv": self.candidates,
+            folder / "wide_field_contrast.ecsv": self.contrast_curve,
+        }
+        written = [folder / "wide_field.fits", *tables]
+        require_new(written, overwrite)
+        about = self.detection
+        wcs = world_coordinates(self.grid, self.observation)
+        hdus = fits.HDUList(
+            [
+                primary_hdu(self.observation, about.provenance, about.sky.mjd),
+                image_hdu(self.snr, "SNR", "", wcs),
+                image_hdu(self.contrast, "CONTRAST", "", wcs),
+                image_hdu(self.error, "CONTRAST_ERROR", "", wcs),
+                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec", wcs),
+                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
+            ]
+        )
+        write_fits(hdus, written[0])
+        for path, table in tables.items():
+            write_table(table, path)
+        return written
+
+
+# Search of the whole frames, seamless with that of the pixels about the star.
 
 _log = logging.getLogger(__name__)
 

@@ -12,10 +12,13 @@ from pyklip_diffrender.drawing.curves import (
 )
 from pyklip_diffrender.drawing.figures import (
     axes_for,
+    compass,
+    halo,
     new_figure,
     panel,
     save,
     to_png,
+    unit_label,
     wide_panel,
 )
 from pyklip_diffrender.drawing.images import (
@@ -27,7 +30,6 @@ from pyklip_diffrender.drawing.images import (
     star_image,
     wavefront_map,
 )
-from pyklip_diffrender.drawing.marks import compass, halo, unit_label
 from pyklip_diffrender.drawing.measurements import Epoch, Stamp, corner, sky_track, stamp_panels
 
 __all__ = [

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from pyklip_diffrender.drawing.marks import ACCENT, INK, halo
+from pyklip_diffrender.drawing.figures import ACCENT, INK, halo
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

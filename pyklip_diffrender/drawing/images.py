@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pyklip_diffrender.drawing.marks import INK, circles, compass, label_sky
+from pyklip_diffrender.drawing.figures import INK, circles, compass, label_sky
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

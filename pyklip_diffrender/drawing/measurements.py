@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pyklip_diffrender.drawing.figures import ACCENT, INK, compass, halo
 from pyklip_diffrender.drawing.images import show_pixels
-from pyklip_diffrender.drawing.marks import ACCENT, INK, compass, halo
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

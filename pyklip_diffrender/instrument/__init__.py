@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pyklip_diffrender.instrument.aberrations import ChromaticAberration, internal_wavefront_error
 from pyklip_diffrender.instrument.jwst import (
     TABULATED_GAP,
     is_jwst_pupil,
@@ -22,10 +21,17 @@ from pyklip_diffrender.instrument.masks import (
 from pyklip_diffrender.instrument.nircam import (
     FLIGHT_ALIGNMENT,
     NIRCAM_LW_PIXELSCALE,
+    ChromaticAberration,
+    internal_wavefront_error,
     nircam_coronagraph,
 )
-from pyklip_diffrender.instrument.planet_spectra import PlanetSpectra, planet_spectra
-from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
+from pyklip_diffrender.instrument.spectrum import (
+    PlanetSpectra,
+    blackbody,
+    filter_bandpass,
+    filter_throughput,
+    planet_spectra,
+)
 
 __all__ = [
     "FILTERS",

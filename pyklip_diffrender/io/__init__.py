@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pyklip_diffrender.io.files import embedded_table, open_fits, replacing, sha256, write_fits
-from pyklip_diffrender.io.headers import sensing_date
+from pyklip_diffrender.io.headers import same_name, sensing_date
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.names import same_name
 from pyklip_diffrender.io.progress import ProgressBar, stage
 from pyklip_diffrender.io.units import (
     ARCSEC,

@@ -1,28 +1,106 @@
-"""Read values of FITS headers with checks, because headers are often edited by hand."""
+"""FITS headers: values and names read with checks, and the package's own keywords."""
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 import unicodedata
+from collections.abc import Iterable
+from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
+from astropy import units as u
 from astropy.io import fits
 from astropy.time import Time
 
-from pyklip_diffrender.errors import CorruptFileError
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 
 __all__ = [
+    "KEYWORDS",
+    "Keyword",
     "card_error",
     "day_and_time",
     "fits_text",
+    "fits_unit",
     "header_date",
     "header_number",
     "header_text",
     "merged_header",
+    "same_name",
     "sensing_date",
+    "set_keyword",
+    "unknown_name",
 ]
+
+
+# Names of stars and filters, which archives and observers spell differently.
+
+_SIMBAD = re.compile(r"(V|NAME|\*+)?\*?[\s_-]+", re.IGNORECASE)
+"""Prefixes of names in SIMBAD, and of observers after it: V* AU Mic, V-AU-MIC, * bet Pic."""
+
+
+_SLIP = 0.6
+"""Least similarity of the digits of a name and of the same with one of three digits wrong."""
+
+_SIGN = re.compile(r"\+(?=\s*\d)")
+"""A plus sign before digits, which belongs to the name: BD+20 1790 is not BD-20 1790."""
+
+
+def same_name(first: str | None, second: str | None) -> bool:
+    """Whether two names differ only in case, separators and SIMBAD's marks before the name.
+
+    A plus sign before digits counts. A minus sign cannot be told from a dash.
+
+    Examples
+    --------
+    >>> same_name("V* AU Mic", "au-mic"), same_name("BD+20-1790", "BD-20-1790")
+    (True, False)
+    """
+    names = [str(each) for each in (first, second)]
+    return _plain(names[0]) == _plain(names[1]) or _bare(names[0]) == _bare(names[1])
+
+
+def unknown_name(key: str, choice: str, names: Iterable[str | None]) -> IncompatibleSetupError:
+    """Error for a name that is not among those there are, with the one that may be meant.
+
+    Examples
+    --------
+    >>> print(unknown_name("target", "HIP 17659", ["HIP 17695", "AU Mic"]))
+    target: got 'HIP 17659', expected one of 'AU Mic', 'HIP 17695'. Did you mean 'HIP 17695'?
+    >>> print(unknown_name("target", "HIP 1234", ["HIP 17695", "AU Mic"]))
+    target: got 'HIP 1234', expected one of 'AU Mic', 'HIP 17695'
+    """
+    known = sorted({str(name) for name in names})
+    # Another number is another star, however alike the names are.
+    by_plain = {_plain(name): name for name in known if _alike_numbers(choice, name)}
+    nearest = difflib.get_close_matches(_plain(choice), by_plain, n=1, cutoff=0.4)
+    hint = f". Did you mean {by_plain[nearest[0]]!r}?" if nearest else ""
+    return IncompatibleSetupError(
+        f"{key}: got {choice!r}, expected one of {', '.join(map(repr, known))}{hint}"
+    )
+
+
+def _alike_numbers(first: str, second: str) -> bool:
+    """Whether two names have the same digits but for a slip of the fingers, or one has none."""
+    one, other = ("".join(filter(str.isdigit, name)) for name in (first, second))
+    if not (one and other):
+        return True
+    return difflib.SequenceMatcher(None, one, other).ratio() >= _SLIP
+
+
+def _plain(name: str) -> str:
+    signed = _SIGN.sub("\x01", name.upper())
+    return "".join(c for c in signed if c.isalnum() or c == "\x01")
+
+
+def _bare(name: str) -> str:
+    mark = _SIMBAD.match(name)
+    return _plain(name[mark.end() :] if mark else name)
+
+
+# Read values of FITS headers with checks, because headers are often edited by hand.
 
 _DATED_NAME = re.compile(r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)")
 """A date in the name of a file: opd_2022-08-14.fits.gz, R2022081402-NRCA3_FP1-1.fits."""
@@ -176,3 +254,130 @@ def sensing_date(header: fits.Header, name: str) -> Time | None:
         return Time("-".join(match.groups()), scale="utc")
     except ValueError:  # Digits that are no date.
         return None
+
+
+# The package's own FITS keywords: one declaration of their names, comments and meanings.
+
+_PIPELINE = u.MJy / u.sr
+
+
+@dataclass(frozen=True)
+class Keyword:
+    """A keyword of products.
+
+    Attributes
+    ----------
+    name : str
+    comment : str
+        Comment of the card; empty where the value leaves no room for one.
+    files : str
+        "reduce" for files of reductions, fits and searches, "pyKLIP" for products of
+        ``algo="diffrender"``, "psf" for rendered images; several are separated by commas.
+    meaning : str
+        What the comment leaves out, for the documentation.
+    """
+
+    name: str
+    comment: str
+    files: str
+    meaning: str = ""
+
+
+_DECLARED = (
+    Keyword("DRVERS", "version of pyklip_diffrender", "reduce, pyKLIP, psf"),
+    Keyword("DRALGO", "star subtraction algorithm", "pyKLIP", "Always `diffrender`."),
+    Keyword("DRIMAGE", "image in the products", "pyKLIP",
+            "`cleaned`, `flux` or `subtracted`, see `DiffrenderSettings.image`."),
+    Keyword("DRSTAT", "how the refinement ended", "reduce, pyKLIP",
+            "Name of a `Status`, such as `CONVERGED`; of several fits, that of the one with the "
+            "largest chi-squared."),
+    Keyword("DRCHI2", "chi-squared per fitted pixel", "reduce, pyKLIP",
+            "Of several fits, the largest."),
+    Keyword("DRMODERR", "model error, fraction of the star", "reduce",
+            "0 where the model explains the data."),
+    Keyword("DRERRFAC", "median factor of the errors", "reduce",
+            "Errors in the file include the factor."),
+    Keyword("DRTHRESH", "smallest S/N of a candidate", "reduce"),
+    Keyword("DRSTARJY", "[Jy] flux density of the star", "reduce",
+            "In the filter, as contrasts refer to it."),
+    Keyword("DRNFRAME", "number of fitted frames", "reduce"),
+    Keyword("DRNFIT", "number of refinements", "pyKLIP"),
+    Keyword("DRPIXELS", "pixels that were fitted", "pyKLIP"),
+    Keyword("DRGAIN", "decrease of chi-squared by a disk", "reduce"),
+    Keyword("DRFILLED", "flagged pixels replaced by neighbours", "pyKLIP"),
+    Keyword("DRNOISE", "where the errors came from", "pyKLIP"),
+    Keyword("DRKEPT", "companions in the model of the star", "pyKLIP",
+            "Of several fits, the largest number. Their light is not subtracted."),
+    Keyword("DRSECS", "[s] duration of the refinement", "reduce"),
+    Keyword("DRFILT", "filter of the model", "pyKLIP"),
+    Keyword("DROPD", "wavefront map at the start", "reduce, pyKLIP",
+            "Name of its file, or `flat wavefront`."),
+    Keyword("DRSHA256", "", "reduce, pyKLIP",
+            "SHA-256 of the file of the wavefront map, or of its array."),
+    Keyword("DROPDDAT", "date of the wavefront map", "pyKLIP", "Only for maps with a date."),
+    Keyword("DROPDHRS", "[h] from the frames to the map", "pyKLIP",
+            "From their mean date; negative for an earlier map."),
+    Keyword("DRSYST", "flat-field pattern", "reduce, pyKLIP",
+            "Its name, which lists the stars that it was learned from, or `none`."),
+    Keyword("DRREFS", "reference frames that were used", "pyKLIP"),
+    Keyword("DRTHRU", "median throughput of faint sources", "pyKLIP",
+            "Median of `-throughput.fits` over the fitted pixels."),
+    Keyword("DRTHSTEP", "pixels between computed positions", "pyKLIP", "Of `-throughput.fits`."),
+    Keyword("DRFMFLUX", "fitted flux over that of the forward model", "pyKLIP",
+            "Of forward models, as all keywords that begin with DRFM."),
+    Keyword("DRFMFERR", "standard deviation of DRFMFLUX", "pyKLIP"),
+    Keyword("DRFMFACT", "included factor for errors that are too small", "pyKLIP"),
+    Keyword("DRFMRA", "[pixel] fitted position east of the star", "pyKLIP"),
+    Keyword("DRFMRAER", "[pixel] standard deviation of DRFMRA", "pyKLIP"),
+    Keyword("DRFMDE", "[pixel] fitted position north of the star", "pyKLIP"),
+    Keyword("DRFMDEER", "[pixel] standard deviation of DRFMDE", "pyKLIP"),
+    Keyword("DRPROP", "propagation through image planes", "psf"),
+    Keyword("DRPREC", "floating point precision", "psf"),
+    Keyword("DRSIFLIP", "SI WFE map flipped vertically", "psf", "As in stpsf from 2.2.0 on."),
+)  # fmt: skip
+
+KEYWORDS = {each.name: each for each in _DECLARED}
+"""The keywords by name, in the order of the documentation."""
+
+
+def set_keyword(header: fits.Header, name: str, value: Any) -> None:
+    """Set one of the package's keywords, with its comment.
+
+    Parameters
+    ----------
+    header : Header
+        Changed.
+    name : str
+    value : str, bool, int or float
+        Numbers that are not finite, which FITS headers cannot have, are written as text.
+
+    Raises
+    ------
+    KeyError
+        For a keyword that is not declared.
+    """
+    comment = KEYWORDS[name].comment
+    if isinstance(value, float) and not math.isfinite(value):
+        value = str(value)
+    value = fits_text(value) if isinstance(value, str) else value
+    # A value may fill the whole card.
+    header[name] = (value, comment) if comment else value
+
+
+def fits_unit(unit: u.UnitBase) -> str:
+    """A unit for BUNIT, as JWST's pipeline spells its own.
+
+    Examples
+    --------
+    >>> from astropy import units as u
+    >>> fits_unit(u.Unit("MJy sr-1"))
+    'MJy/sr'
+    >>> fits_unit(u.adu / u.s)
+    'adu s-1'
+    """
+    if unit == _PIPELINE:
+        return "MJy/sr"
+    try:
+        return str(unit.to_string("fits"))
+    except ValueError:  # The standard does not know electrons, which frames may be in.
+        return str(unit.to_string())

@@ -1,4 +1,4 @@
-"""Convert input to float64 arrays in SI units or arcsec, and check it.
+"""Convert input to float64 arrays in SI units or arcsec, and check it; angles and rotations.
 
 All input goes through these functions before it reaches torch, because `torch.as_tensor(1 * u.um)`
 is 1.0, `torch.from_numpy` refuses big-endian arrays, and `numpy.asarray` drops the mask and the
@@ -7,8 +7,9 @@ unit of most containers. Inputs are never modified.
 
 from __future__ import annotations
 
+import math
 import warnings
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from astropy import units as u
@@ -26,11 +27,14 @@ from pyklip_diffrender.errors import (
 __all__ = [
     "ARCSEC",
     "Bound",
+    "full_circle",
+    "half_circle",
     "native_float64",
     "require_bound",
     "require_finite",
     "require_positive",
     "require_shape",
+    "rotation_matrix",
     "set_numbers",
     "to_arcsec",
     "to_mask",
@@ -40,6 +44,59 @@ __all__ = [
     "to_unit",
     "warn_of_rms",
 ]
+
+
+# Angles, and rotations of positions in a plane.
+
+Angle = TypeVar("Angle", float, NDArray[np.float64])
+
+
+def full_circle(degrees: Angle) -> Angle:
+    """Return an angle from 0 to 360 degrees, the range of all position angles.
+
+    Examples
+    --------
+    >>> full_circle(-54.0)
+    306.0
+    """
+    # Twice, because rounding makes 360 of a tiny negative angle.
+    return degrees % 360 % 360
+
+
+def half_circle(degrees: Angle) -> Angle:
+    """Return the difference of two angles, from -180 to 180 degrees.
+
+    Examples
+    --------
+    >>> half_circle(0.5 - 359.5)
+    1.0
+    """
+    return (degrees + 180) % 360 - 180
+
+
+def rotation_matrix(degrees: float) -> NDArray[np.float64]:
+    """Return the matrix that rotates positions (x, y) counter-clockwise, from +x to +y.
+
+    Parameters
+    ----------
+    degrees : float
+
+    Returns
+    -------
+    ndarray, (2, 2)
+        To be multiplied by positions as columns from the left; rows take its transpose from
+        the right.
+
+    Examples
+    --------
+    >>> rotation_matrix(90).round(12) @ [1, 0]
+    array([0., 1.])
+    """
+    cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[cosine, -sine], [sine, cosine]])
+
+
+# Convert input to float64 arrays in SI units or arcsec, and check it.
 
 Bound = Literal["any", "not negative", "positive"]
 """Which finite numbers a value may be."""

@@ -10,13 +10,13 @@ Cholesky factor of P + G G^T. The flux of a template p and its error are
 This marginalisation is in section 2.7 of C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes
 for Machine Learning" (2006). Unknowns are rows of G, pixels are columns.
 
-Where pixels share errors of the model, their noise has a covariance C, see `linear.noise`. G G^T
+Where pixels share errors of the model, their noise has a covariance C, see `Noise`. G G^T
 then stands for J C^-1 J^T, with the derivatives J that are not whitened.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -27,10 +27,258 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.linear.frames import LinearFrame, Unknown
-from pyklip_diffrender.linear.noise import Noise
 
-__all__ = ["LinearModel", "TemplateProducts"]
+__all__ = [
+    "FrameRows",
+    "LinearFrame",
+    "LinearModel",
+    "Noise",
+    "TemplateProducts",
+    "Unknown",
+    "pixel_pieces",
+    "summed_rows",
+]
+
+
+# The unknowns of a linear model, and the part that one frame has in it.
+
+_PIXELS = 1024
+"""Number of pixels that are processed at a time, where there is a number for every unknown."""
+
+
+class Unknown(NamedTuple):
+    """One unknown of a fit.
+
+    Attributes
+    ----------
+    name : str
+        A parameter of the parameter table, or "companions", "amplitude", "modes" or "drift".
+    component : int
+        Index within that parameter.
+    frame : int
+        The frame whose own value it is, or the block of drift; -1 if all frames share it.
+    """
+
+    name: str
+    component: int
+    frame: int = -1
+
+    def __str__(self) -> str:
+        suffix = "" if self.frame < 0 else f" of frame {self.frame}"
+        return f"{self.name}[{self.component}]{suffix}"
+
+
+@dataclass(frozen=True)
+class FrameRows:
+    """The unknowns of a fit that the rows of one of its frames belong to.
+
+    Attributes
+    ----------
+    rows : Tensor, (rows,), int64
+        Index of the unknown that each row belongs to.
+    drift : Tensor, (blocks, some), int64
+        Indices of the unknowns by which the leading wavefront modes of this frame differ from
+        those that all frames share. One block may be the frame's own, and another one that of its
+        exposure sequence.
+    first_mode : int
+        Index of the first wavefront mode among the rows.
+    """
+
+    rows: Tensor
+    drift: Tensor
+    first_mode: int
+
+    def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
+        """Sum values by row, (rows, k), to values by unknown, (size, k)."""
+        total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
+        total.index_add_(0, self.rows, on_rows)
+        leading = on_rows[self.first_mode : self.first_mode + self.drift.shape[-1]]
+        for block in self.drift:
+            total.index_add_(0, block, leading)
+        return total
+
+    def of_unknowns(self, values: Tensor) -> Tensor:
+        """Values by row from values by unknown; the adjoint of `onto_unknowns`."""
+        rows = values[self.rows]
+        for block in self.drift:
+            rows[self.first_mode : self.first_mode + len(block)] += values[block]
+        return rows
+
+
+@dataclass(frozen=True)
+class LinearFrame(FrameRows):
+    """One frame's part of a linear model.
+
+    Attributes
+    ----------
+    residual : Tensor, (ny, nx), float64
+        Data minus prediction where the model is linearised.
+    weight : Tensor, (ny, nx), float64
+        1 / standard deviation; 0 for masked pixels.
+    jacobian : Tensor, (rows, ny, nx), float32
+        Derivatives of the pixels with respect to the unknowns, in the data's unit.
+    common : Tensor, (ny, nx), float64
+        c of the pattern that the frames share, see `Noise`, in the data's unit; 0 without
+        one.
+    """
+
+    residual: Tensor
+    weight: Tensor
+    jacobian: Tensor
+    common: Tensor
+
+    def image(self, values: Tensor) -> Tensor:
+        """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""
+        on_rows = self.of_unknowns(values).movedim(0, -1)
+        flat = self.jacobian.flatten(1)
+        parts = [on_rows @ flat[:, piece].double() for piece in pixel_pieces(flat.shape[1])]
+        return torch.cat(parts, dim=-1).unflatten(-1, self.jacobian.shape[1:])
+
+    def pulled(self, images: Tensor) -> Tensor:
+        """Products of the derivatives with images, (k, ny, nx), by row: (rows, k).
+
+        They are computed in the precision of the images. The rounding errors of single precision
+        exceed the noise where a companion's light is 1e5 standard deviations.
+        """
+        flat, columns = self.jacobian.flatten(1), images.flatten(1).T
+        if images.dtype == flat.dtype:
+            return flat @ columns
+        total = torch.zeros(len(flat), columns.shape[1], dtype=images.dtype)
+        for piece in pixel_pieces(len(columns)):
+            total += flat[:, piece].to(images.dtype) @ columns[piece]
+        return total
+
+
+def pixel_pieces(pixels: int) -> list[slice]:
+    """Parts of an image of which arrays with all unknowns are small."""
+    return [slice(start, start + _PIXELS) for start in range(0, pixels, _PIXELS)]
+
+
+# The covariance of the noise of frames that are fitted together, and its inverse.
+#
+# The noise of a frame f has two parts, with the starlight s_f and pixels p:
+#
+# 1. Noise of the frame and errors of the model that are independent from pixel to pixel. Its
+#    standard deviation is 1 / w_f.
+# 2. The error of the flat-field pattern, where frames show the same pixels of the detector. A
+#    pattern m_p with a Gaussian prior of width g_p multiplies the starlight of every frame: g_p^2
+#    s_fp s_f'p in pixel p.
+#
+# The covariance of one pixel in all frames is diag(1 / w_f^2) + g^2 s s^T. Its inverse is diagonal
+# but for one term (the Sherman-Morrison formula),
+#
+#     C^-1 = W - W c c^T W,    c_f = s_f g / sqrt(1 + g^2 sum_f w_f^2 s_f^2),    W = diag(w_f^2),
+#
+# so that every inner product loses the product of two images that are summed over frames with the
+# weights W c. A `Noise` knows the pattern by its c. For images that are divided by their own noise,
+# C^-1 = w M^-1 w with M^-1 = 1 - t t^T and t = w c.
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise of the pixels of frames that are fitted together, with covariance C.
+
+    Attributes
+    ----------
+    weight : tuple of Tensor, (ny, nx)
+        By frame, w: 1 / standard deviation of the independent noise; 0 for masked pixels.
+    common : tuple of Tensor, (ny, nx)
+        c of the pattern that the frames share, in the data's unit; 0 if they share none.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from pyklip_diffrender.linear.model import Noise
+    >>> ones = torch.ones(8, 8, dtype=torch.float64)
+    >>> Noise((ones, ones), (0 * ones, 0 * ones)).chi2([ones, ones])
+    128.0
+
+    A pattern may explain what the frames have in common:
+
+    >>> Noise((ones, ones), (0.7 * ones, 0.7 * ones)).chi2([ones, ones]) < 10
+    True
+    """
+
+    weight: tuple[Tensor, ...]
+    common: tuple[Tensor, ...]
+
+    @cached_property
+    def shares_pattern(self) -> bool:
+        """Whether the frames share a pattern of the detector."""
+        return any(bool((each != 0).any()) for each in self.common)
+
+    @cached_property
+    def _pattern_power(self) -> Tensor:
+        """t^T t of every pixel, (ny, nx)."""
+        products = [(w * c) ** 2 for w, c in zip(self.weight, self.common, strict=True)]
+        return torch.stack(products).sum(dim=0)
+
+    def _summed(self, images: Mapping[int, Tensor]) -> Tensor:
+        """Sum of W c x over frames, for images x, (..., ny, nx)."""
+        total = torch.zeros_like(next(iter(images.values())))
+        for k, image in images.items():
+            total += self.weight[k] ** 2 * self.common[k] * image
+        return total
+
+    def inverse(self, images: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """C^-1 x over w of images x, (..., ny, nx), by frame; 0 in masked pixels.
+
+        Frames that are missing have no light. Without correlations between frames they are missing
+        in the result as well.
+        """
+        if not self.shares_pattern:
+            return {k: self.weight[k].to(x.dtype) * x for k, x in images.items()}
+        images = {k: x.double() for k, x in images.items()}
+        summed = self._summed(images)
+        return {
+            k: weight * (images.get(k, torch.zeros(())) - common * summed)
+            for k, (weight, common) in enumerate(zip(self.weight, self.common, strict=True))
+        }
+
+    def weighted(self, images: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """C^-1 x of images x, as `inverse`."""
+        if self.shares_pattern:
+            inverse = self.inverse(images)
+            return {k: self.weight[k].to(x.dtype) * x for k, x in inverse.items()}
+        return {k: (self.weight[k] ** 2).to(x.dtype) * x for k, x in images.items()}
+
+    def whitened(self, images: Mapping[int, Tensor]) -> Tensor:
+        """Images in units in which their noise is independent and has a variance of 1.
+
+        Scalar products of the results, (k, pixels of frames), are x^T C^-1 y of the images x and y,
+        (k, ny, nx) by frame.
+        """
+        if not self.shares_pattern:
+            white = self.inverse(images)
+        else:
+            # (1 - a t t^T)^2 = 1 - t t^T = M^-1 with a = 1 / (1 + sqrt(1 - t^T t)).
+            summed = self._summed({k: x.double() for k, x in images.items()})
+            part = summed / (1 + torch.sqrt(1 - self._pattern_power))
+            white = {
+                k: weight * (images.get(k, torch.zeros(())) - common * part)
+                for k, (weight, common) in enumerate(zip(self.weight, self.common, strict=True))
+            }
+        return torch.cat([each.flatten(1) for each in white.values()], dim=1)
+
+    def chi2(self, images: Sequence[Tensor]) -> float:
+        """x^T C^-1 x of images x, (ny, nx), of all frames."""
+        by_frame = dict(enumerate(images))
+        total = sum(float(((self.weight[k] * x) ** 2).sum()) for k, x in by_frame.items())
+        return total - float((self._summed(by_frame) ** 2).sum()) if self.shares_pattern else total
+
+
+def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
+    """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
+    total = torch.zeros(unknowns, frames[0].weight.numel(), dtype=torch.float32)
+    for frame in frames:
+        scale = (torch.ones(()) * (frame.weight**2 * frame.common).float()).flatten()
+        for pixels in pixel_pieces(total.shape[1]):
+            on_rows = frame.jacobian.flatten(1)[:, pixels] * scale[pixels]
+            total[:, pixels] += frame.onto_unknowns(on_rows, unknowns)
+    return total
+
+
+# The linear model of a fit: the Jacobian of all unknowns and their posterior covariance.
 
 _BATCH = 512
 """Number of templates that are processed at a time."""

@@ -3,18 +3,7 @@
 from __future__ import annotations
 
 from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.detector_effects import (
-    ChainDetector,
-    Effect,
-    GaussianBlur,
-    LinearResampling,
-    PixelCrosstalk,
-)
-from pyklip_diffrender.optics.differentiation import Cache, Position
-from pyklip_diffrender.optics.fast.occulter import finest_spacing
-from pyklip_diffrender.optics.fast.point_sources import PointSources
-from pyklip_diffrender.optics.fourier import MatrixFourier, kernel
+from pyklip_diffrender.optics.fast_path import finest_spacing
 from pyklip_diffrender.optics.grid import (
     JWST_DIAMETER,
     PupilGrid,
@@ -22,10 +11,26 @@ from pyklip_diffrender.optics.grid import (
     resample,
     transform_polygons,
     widen_polygon,
+    zernike_basis,
 )
-from pyklip_diffrender.optics.planes import EntrancePupil, LyotStop, Plane, Wavefront
+from pyklip_diffrender.optics.planes import (
+    Cache,
+    ChainDetector,
+    Detector,
+    Effect,
+    EntrancePupil,
+    GaussianBlur,
+    LinearResampling,
+    LyotStop,
+    MatrixFourier,
+    PixelCrosstalk,
+    Plane,
+    Position,
+    Wavefront,
+    kernel,
+)
+from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.optics.zernike import zernike_basis
 
 __all__ = [
     "JWST_DIAMETER",

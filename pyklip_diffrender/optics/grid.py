@@ -1,4 +1,4 @@
-"""Pupil grids and the exact rasterisation of polygons onto them.
+"""Pupil grids, the exact rasterisation of polygons onto them, and Zernike polynomials.
 
 Orientation: all pupil planes are in OTE entrance-pupil orientation, x along +V2 and y along
 +V3, arrays [y, x], pixel centres at ``(arange(n) - (n - 1) / 2) * D / n``.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from math import comb, sqrt
 
 import numpy as np
 import torch
@@ -21,12 +22,15 @@ __all__ = [
     "JWST_DIAMETER",
     "STAR_RADIUS",
     "PupilGrid",
+    "noll_indices",
     "polygon_coverage",
     "resample",
     "samples_for_field",
     "transform_polygons",
     "widen_polygon",
+    "zernike_basis",
 ]
+
 
 JWST_DIAMETER = 6.603464
 """Circumscribed diameter of the primary, m (stpsf.constants 2.2.0)."""
@@ -313,3 +317,60 @@ def widen_polygon(polygon: Tensor, distance: float) -> Tensor:
     # A corner moves along the bisector so far that both its edges move by the distance.
     bisector = (before + normal) / (1 + (before * normal).sum(dim=1, keepdim=True))
     return polygon + distance * bisector
+
+
+# Noll-ordered Zernike polynomials, normalised to unit rms on the disc.
+#
+# R. J. Noll, "Zernike polynomials and atmospheric turbulence", J. Opt. Soc. Am. 66, 207 (1976).
+
+
+def noll_indices(j: int) -> tuple[int, int]:
+    """Radial order n and azimuthal frequency m (negative for sines) of Noll index `j` >= 1."""
+    n = 0
+    while (n + 1) * (n + 2) // 2 < j:
+        n += 1
+    rank = j - n * (n + 1) // 2
+    magnitude = 2 * (rank // 2) if n % 2 == 0 else 2 * ((rank - 1) // 2) + 1
+    return n, magnitude if j % 2 == 0 else -magnitude
+
+
+def zernike_basis(count: int, x: Tensor, y: Tensor, radius: float) -> Tensor:
+    """Sample the first `count` Noll Zernikes on a rectangular grid; zero outside the disc.
+
+    Parameters
+    ----------
+    count : int
+        Number of polynomials, from Noll index 1 (piston).
+    x, y : Tensor, (columns,), (rows,)
+        Positions, m.
+    radius : float
+        Radius of the disc, m.
+
+    Returns
+    -------
+    Tensor, (count, rows, columns)
+    """
+    # rho^m exp(i m theta) is a power of x + i y: no trigonometry, and smooth at the centre.
+    point = torch.complex(*torch.broadcast_tensors(x[None, :] / radius, y[:, None] / radius))
+    squared = point.real**2 + point.imag**2
+    inside = (squared <= 1).to(squared.dtype)
+    highest = noll_indices(count)[0]
+    waves = [torch.ones_like(point)]
+    even = [torch.ones_like(squared)]
+    for _ in range(highest):
+        waves.append(waves[-1] * point)
+        even.append(even[-1] * squared)
+    basis = []
+    for j in range(1, count + 1):
+        n, m = noll_indices(j)
+        half = (n - abs(m)) // 2
+        radial = sum(
+            (-1) ** k * comb(n - k, k) * comb(n - 2 * k, half - k) * even[half - k]
+            for k in range(half + 1)
+        )
+        if m == 0:
+            basis.append(sqrt(n + 1) * radial * inside)
+        else:
+            wave = waves[m].real if m > 0 else waves[-m].imag
+            basis.append(sqrt(2 * (n + 1)) * radial * wave * inside)
+    return torch.stack(basis)

@@ -1,7 +1,7 @@
-"""The planes of a coronagraph: pupils, the compact occulter, internal aberrations.
+"""The planes of a coronagraph, from the pupil to the detector, and the transforms between them.
 
 The whole propagation, with xi, eta positions in the pupil (m), x, y angles on the sky (radians),
-F the transform from the pupil to the sky (`optics.fourier`), and all fields in the orientation of
+F the transform from the pupil to the sky (`optics.planes`), and all fields in the orientation of
 the entrance pupil:
 
     E0 = A exp(2 pi i OPD / lambda) exp(-2 pi i (x0 xi - y0 eta) / lambda)     `EntrancePupil`
@@ -28,30 +28,243 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Self
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.differentiation import Cache, Position, cached, position_of
-from pyklip_diffrender.optics.fourier import MatrixFourier, tilt_phases
-from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, transform_polygons
-from pyklip_diffrender.optics.zernike import zernike_basis
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.io.units import ARCSEC, native_float64
+from pyklip_diffrender.optics.grid import (
+    PupilGrid,
+    polygon_coverage,
+    transform_polygons,
+    zernike_basis,
+)
 
 __all__ = [
+    "Cache",
+    "ChainDetector",
     "CompactOcculter",
+    "Detector",
+    "Effect",
     "EntrancePupil",
+    "GaussianBlur",
     "InternalAberration",
+    "LinearResampling",
     "LyotStop",
+    "MatrixFourier",
+    "PixelCrosstalk",
     "Plane",
+    "Position",
     "Values",
     "Wavefront",
+    "cached",
+    "centred",
+    "has_memory",
+    "is_plain",
+    "kernel",
+    "mirrored_convolution",
     "phase_factor",
+    "position_of",
+    "tilt_phases",
 ]
+
+
+# Distinguish differentiated tensors from constants, whose results may be cached.
+
+Key = TypeVar("Key", bound=Hashable)
+Made = TypeVar("Made")
+
+Position = tuple[tuple[str, float], ...]
+"""Named values as plain numbers, as a key for results computed from them."""
+
+
+class Cache(dict[Key, Made]):
+    """Constants by key, each made once. Copies by `pickle` and `copy.deepcopy` are empty.
+
+    Nothing is stored within a transform of `torch.func`, which wraps all results: wrapped tensors
+    cannot be copied or written after it has ended.
+    """
+
+    def kept(self, key: Key, make: Callable[[], Made]) -> Made:
+        """The constant for a key, which `make` makes if there is none yet."""
+        made = self.get(key)
+        if made is None:
+            self[key] = made = make()
+        return made
+
+    def __setitem__(self, key: Key, made: Made) -> None:
+        if has_memory(torch.zeros(()) + 0):
+            super().__setitem__(key, made)
+
+    def __reduce__(self) -> tuple[type[Cache[Key, Made]], tuple[()]]:
+        return type(self), ()
+
+
+def has_memory(tensor: Tensor) -> bool:
+    """Whether a tensor is not wrapped by a transform of `torch.func`, nor a dual number.
+
+    Tensors in reverse mode by `backward` or `torch.autograd.grad` are not wrapped.
+    """
+    try:
+        tensor.data_ptr()
+    except RuntimeError:
+        return False  # A wrapper without memory of its own.
+    return unpack_dual(tensor).tangent is None
+
+
+def is_plain(tensor: Tensor) -> bool:
+    """Whether a tensor takes part in no differentiation at all."""
+    return has_memory(tensor) and not (tensor.requires_grad and torch.is_grad_enabled())
+
+
+def position_of(values: Mapping[str, Tensor], names: Iterable[str]) -> Position | None:
+    """Values of the named parameters, or None if one of them is being differentiated.
+
+    Names without a value are omitted.
+    """
+    position = []
+    for name in sorted(set(names) & set(values)):
+        if not is_plain(values[name]):
+            return None
+        position += [(name, number) for number in values[name].flatten().tolist()]
+    return tuple(position)
+
+
+def cached(
+    store: Cache[Key, tuple[Position, Made]],
+    key: Key,
+    position: Position | None,
+    make: Callable[[], Made],
+) -> Made:
+    """The stored result for a key if it was made at the same position, else a new one.
+
+    Only the latest result for each key is stored. Nothing is stored while differentiating
+    (position None), nor within a transform of `torch.func`, see `Cache`.
+
+    Parameters
+    ----------
+    store : Cache
+    key : hashable
+    position : Position or None
+        See `position_of`.
+    make : callable
+        Makes a new result.
+    """
+    if position is None:
+        return make()
+    latest = store.get(key)  # Read only once: another thread may replace it at any moment.
+    if latest is None or latest[0] != position:
+        store[key] = latest = (position, make())
+    return latest[1]
+
+
+# Fraunhofer propagation between pupil and image by matrix products.
+#
+# Convention, with x, y angles on the image (radians, image orientation as in stpsf) and xi, eta
+# positions in the entrance-pupil orientation (m),
+#
+#     E(x, y) = 1/lambda  sum  E(xi, eta) exp(+2 pi i (x xi - y eta) / lambda) d_xi d_eta
+#
+# The minus sign is the inversion in y between the JWST entrance and exit pupils. |E|^2 is then
+# light per steradian, and sums over the image and over the pupil are equal (Parseval). A source at
+# (x0, y0) has the pupil phase -2 pi (x0 xi - y0 eta) / lambda.
+
+
+def centred(grid: PupilGrid) -> PupilGrid:
+    """The window with rows and columns added so that it is symmetric about the axis."""
+    row, column = (max(stop, grid.npix - start) for start, stop in (grid.rows, grid.columns))
+    return replace(grid, rows=(grid.npix - row, row), columns=(grid.npix - column, column))
+
+
+def kernel(image: Tensor, pupil: Tensor, wavelength: float, sign: int) -> Tensor:
+    """``exp(sign 2 pi i image pupil / wavelength)``, (image, pupil), in double precision."""
+    turns = image[:, None] * pupil[None, :] / wavelength
+    # Whole turns are dropped before the cosine, to keep the phase small for any field.
+    angle = sign * 2 * math.pi * (turns - torch.round(turns.detach()))
+    return torch.complex(torch.cos(angle), torch.sin(angle))
+
+
+def tilt_phases(offset: Tensor, grid: PupilGrid, wavelength: float) -> tuple[Tensor, Tensor]:
+    """Pupil phase of a source off the axis, as a sum of a function of x and one of y.
+
+    Parameters
+    ----------
+    offset : Tensor, (..., 2)
+        x, y of the source on the image, radians.
+    grid : PupilGrid
+    wavelength : float
+        m.
+
+    Returns
+    -------
+    Tensor, (..., columns) and (..., rows)
+        Radians, each within half a turn.
+    """
+    x_turns = -offset[..., 0:1] * grid.x.to(offset.device) / wavelength
+    y_turns = offset[..., 1:2] * grid.y.to(offset.device) / wavelength
+    return tuple(2 * math.pi * (t - torch.round(t.detach())) for t in (x_turns, y_turns))  # type: ignore[return-value]
+
+
+class MatrixFourier:
+    """The Fourier transform between one pupil window and one set of image positions.
+
+    The matrices are built once, in double precision, and cast; forward and inverse are two
+    matrix products each (R. Soummer et al., "Fast computation of Lyot-style coronagraph
+    propagation", Opt. Express 15, 15935, 2007). The large product is the one along y.
+
+    Parameters
+    ----------
+    grid : PupilGrid
+        The pupil window.
+    x, y : Tensor, (columns,), (rows,), float64
+        Image positions, radians. They may require gradients.
+    wavelength : float
+        m.
+    dtype : torch.dtype
+        complex128 or complex64.
+    shear : float
+        Increase of y with x on the image: the true y of pixel (i, j) is ``y[i] + shear x[j]``.
+    """
+
+    def __init__(
+        self,
+        grid: PupilGrid,
+        x: Tensor,
+        y: Tensor,
+        wavelength: float,
+        dtype: torch.dtype = torch.complex128,
+        shear: float = 0.0,
+    ) -> None:
+        self.grid = grid
+        pupil_x, pupil_y = grid.x.to(x.device), grid.y.to(x.device)
+        self._columns = kernel(x, pupil_x, wavelength, +1).to(dtype).T.contiguous()
+        self._rows = kernel(y, pupil_y, wavelength, -1).to(dtype)
+        self._shear = (
+            kernel(shear * x, pupil_y, wavelength, -1).T.contiguous().to(dtype) if shear else None
+        )
+        self._scale = grid.spacing**2 / wavelength
+        self._inverse_scale = 1 / wavelength
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Pupil field (..., rows, columns), per m, to image field (..., y, x), per radian."""
+        # Along x first, so that every column can have its own shift in y.
+        columns = self._scale * (field @ self._columns)
+        return self._rows @ (columns if self._shear is None else columns * self._shear)
+
+    def inverse(self, field: Tensor, cell: float) -> Tensor:
+        """Image field (..., y, x) on cells of solid angle `cell` (sr), back to the pupil."""
+        columns = (cell * self._inverse_scale) * (self._rows.mH @ field)
+        return (columns if self._shear is None else columns * self._shear.conj()) @ self._columns.mH
+
+
+# The planes of a coronagraph: pupils, the compact occulter, internal aberrations.
 
 Values = Mapping[str, Tensor]
 
@@ -381,3 +594,250 @@ class CompactOcculter(Plane):
         removed = self._transform(wavefront.wavelength, onto).inverse(blocked, cell)
         field = wavefront.grid.crop(wavefront.field, onto) - removed
         return replace(wavefront, field=field, grid=onto)
+
+
+# The pixel array: sampling of the field, and pixel values from the samples.
+
+
+@dataclass
+class Detector:
+    """The pixel array.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        (ny, nx) detector pixels.
+    pixelscale : tuple of float
+        (x, y) arcsec per pixel.
+    oversample : int
+        Samples per pixel along each axis; a pixel's value is the mean of its samples times the
+        pixel's area, so with 1 it is the intensity at the pixel's centre.
+    shear : float
+        Increase of y with x on the sky, arcsec per arcsec (0 for square axes).
+    centre : tuple of float
+        x, y of the middle of the array on the image, arcsec.
+    """
+
+    shape: tuple[int, int]
+    pixelscale: tuple[float, float]
+    oversample: int
+    dtype: torch.dtype
+    device: torch.device
+    shear: float = 0.0
+    name: str = "detector"
+    centre: tuple[float, float] = (0.0, 0.0)
+    parameters: tuple[str, ...] = ("detector_shift", "blur")
+    # Not copied by `dataclasses.replace`, because a changed detector has other transforms.
+    _transforms: Cache[tuple[float, PupilGrid], MatrixFourier] = field(
+        default_factory=Cache, init=False, repr=False, compare=False
+    )
+
+    def axes(self, values: Values) -> tuple[Tensor, Tensor]:
+        """Sample positions x, y on the image relative to the optical axis, radians."""
+        axes = []
+        shift = values.get("detector_shift")
+        for k, (count, scale) in enumerate(zip(self.shape[::-1], self.pixelscale, strict=True)):
+            samples = count * self.oversample
+            index = torch.arange(samples, dtype=torch.float64, device=self.device)
+            axis = (index - (samples - 1) / 2) * (scale / self.oversample)
+            if shift is not None:
+                axis = axis - shift[..., k].to(self.device)
+            axes.append(axis * ARCSEC + self.centre[k] * ARCSEC)
+        return axes[0], axes[1]
+
+    def field(self, wavefront: Wavefront, values: Values) -> Tensor:
+        """Field on the samples, (..., oversample ny, oversample nx), |field|^2 per sample."""
+
+        def make() -> MatrixFourier:
+            return MatrixFourier(
+                wavefront.grid,
+                *self.axes(values),
+                wavefront.wavelength,
+                self.dtype.to_complex(),
+                self.shear,
+            )
+
+        key = (wavefront.wavelength, wavefront.grid)
+        moved = "detector_shift" in values
+        transform = make() if moved else self._transforms.kept(key, make)
+        return self.per_sample * transform.forward(wavefront.field)
+
+    @property
+    def per_sample(self) -> float:
+        """Square root of a sample's solid angle, radians: the field on it per field per radian."""
+        return math.sqrt(self.pixelscale[0] * self.pixelscale[1]) * ARCSEC / self.oversample
+
+    def image(self, intensity: Tensor, values: Values) -> Tensor:
+        """Pixel values (..., ny, nx) from the intensity on the samples: blur, then binning."""
+        if "blur" in values:
+            for axis, scale in ((-1, self.pixelscale[0]), (-2, self.pixelscale[1])):
+                sigma = values["blur"].reshape(()) * (self.oversample / scale)
+                intensity = _blur(intensity, sigma, axis)
+        if self.oversample == 1:
+            return intensity
+        ny, nx = self.shape
+        k = self.oversample
+        return intensity.reshape(*intensity.shape[:-2], ny, k, nx, k).sum(dim=(-3, -1))
+
+
+def _blur(image: Tensor, sigma: Tensor, axis: int) -> Tensor:
+    """Band-limited Gaussian convolution along one axis, mirrored at the edges.
+
+    Below half a sample a sampled Gaussian is a poor filter; its transform, cut at the Nyquist
+    frequency, is exact for a well-sampled image.
+    """
+    reach = 16
+    frequency = (torch.arange(64, dtype=torch.float64, device=image.device) + 0.5) / 128
+    gain = torch.exp(-2 * (math.pi * sigma.to(image.device) * frequency) ** 2)
+    lag = torch.arange(-reach, reach + 1, dtype=torch.float64, device=image.device)
+    kernel = (gain * torch.cos(2 * math.pi * frequency * lag[:, None])).mean(dim=1)
+    matrix = mirrored_convolution(kernel / kernel.sum(), image.shape[axis]).to(image.dtype)
+    return image @ matrix.T if axis == -1 else matrix @ image
+
+
+def mirrored_convolution(kernel: Tensor, count: int) -> Tensor:
+    """Matrix (count, count) of the convolution with a symmetric kernel, mirrored at the edges."""
+    reach, device = len(kernel) // 2, kernel.device
+    lag = torch.arange(-reach, reach + 1, device=device)
+    folded = (torch.arange(count, device=device)[:, None] + lag) % (2 * count)
+    mirrored = torch.where(folded < count, folded, 2 * count - 1 - folded)
+    matrix = torch.zeros(count, count, dtype=torch.float64, device=device)
+    return matrix.scatter_add(1, mirrored, kernel.expand(count, -1))
+
+
+# Detector effects as linear, differentiable torch functions: blur, geometry, crosstalk.
+#
+# Each follows the numerics of stpsf, with kernels cut as in scipy, so that chains of them agree
+# with stpsf to rounding.
+
+Effect = Callable[[Tensor], Tensor]
+
+
+class GaussianBlur:
+    """Convolution with a Gaussian as in `scipy.ndimage.gaussian_filter`.
+
+    The kernel is sampled and ends at four standard deviations, rounded to whole samples: widths
+    below an eighth of a sample have no effect. The image is mirrored at its edges.
+
+    Parameters
+    ----------
+    sigma : float or Tensor, ()
+        Standard deviation in samples. A tensor may require gradients.
+    """
+
+    def __init__(self, sigma: float | Tensor) -> None:
+        self.sigma = torch.as_tensor(sigma, dtype=torch.float64)
+
+    def _matrix(self, count: int, like: Tensor) -> Tensor:
+        reach = int(4 * float(self.sigma.detach()) + 0.5)
+        if reach == 0:
+            # As in scipy, the image is unchanged, and so the derivative must be zero.
+            return torch.eye(count, dtype=like.dtype, device=like.device)
+        lag = torch.arange(-reach, reach + 1, dtype=torch.float64)
+        kernel = torch.exp(-0.5 * (lag / self.sigma.cpu()) ** 2)
+        kernel = kernel / kernel.sum()
+        return mirrored_convolution(kernel, count).to(like.device, like.dtype)
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Blur (..., rows, columns)."""
+        down = self._matrix(image.shape[-2], image)
+        across = self._matrix(image.shape[-1], image)
+        return down @ image @ across.T
+
+
+class LinearResampling:
+    """Bilinear interpolation at given positions, zero outside the image.
+
+    Parameters
+    ----------
+    rows, columns : array_like, (ny, nx)
+        Position in the image of each sample of the result, in samples.
+    shape : tuple of int
+        Shape of the image.
+    """
+
+    def __init__(self, rows: ArrayLike, columns: ArrayLike, shape: tuple[int, int]) -> None:
+        y, x = native_float64(rows), native_float64(columns)
+        inside = (y >= 0) & (y <= shape[0] - 1) & (x >= 0) & (x <= shape[1] - 1)
+        top = np.clip(np.floor(y), 0, shape[0] - 2).astype(np.int64)
+        left = np.clip(np.floor(x), 0, shape[1] - 2).astype(np.int64)
+        down, right = y - top, x - left
+        self._taps = [
+            (
+                torch.from_numpy((top + i) * shape[1] + left + j),
+                torch.from_numpy(
+                    np.where(inside, (down if i else 1 - down) * (right if j else 1 - right), 0.0)
+                ),
+            )
+            for i in (0, 1)
+            for j in (0, 1)
+        ]
+        self.shape = shape
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Resample (..., rows, columns)."""
+        if image.shape[-2:] != self.shape:
+            raise ShapeError(f"image: got {tuple(image.shape[-2:])}, made for {self.shape}")
+        flat = image.flatten(-2)
+        total = torch.zeros((), dtype=image.dtype, device=image.device)
+        for index, weight in self._taps:
+            total = total + flat[..., index.to(image.device)] * weight.to(image)
+        return total
+
+
+class PixelCrosstalk:
+    """Convolution of pixels with a small kernel of sum 1, zero beyond the edges (IPC, PPC).
+
+    Parameters
+    ----------
+    kernel : array_like, (odd, odd)
+        Distribution of the signal of the middle pixel.
+    """
+
+    def __init__(self, kernel: ArrayLike) -> None:
+        values = native_float64(kernel)
+        if values.ndim != 2 or values.shape[0] % 2 == 0 or values.shape[1] % 2 == 0:
+            raise ShapeError(f"kernel: got shape {values.shape}, expected two odd lengths")
+        self.kernel = torch.from_numpy(values / values.sum())
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Convolve (..., rows, columns)."""
+        # Torch correlates, so the kernel is flipped.
+        turned = self.kernel.flip(0, 1).to(image)[None, None]
+        padding = (self.kernel.shape[0] // 2, self.kernel.shape[1] // 2)
+        images = image.reshape(-1, 1, *image.shape[-2:])
+        return torch.nn.functional.conv2d(images, turned, padding=padding).reshape(image.shape)
+
+
+@dataclass
+class ChainDetector(Detector):
+    """A detector with effects, before and after the samples are binned to pixels.
+
+    Attributes
+    ----------
+    on_samples, on_pixels : tuple of Effect
+        In order.
+    """
+
+    on_samples: tuple[Effect, ...] = ()
+    on_pixels: tuple[Effect, ...] = ()
+
+    def image(self, intensity: Tensor, values: Values) -> Tensor:
+        """See `Detector.image`; a free blur comes before the other effects."""
+        if "blur" in values:
+            # Blur the samples without binning them.
+            shape, oversample = self.shape, self.oversample
+            fine = Detector(
+                (shape[0] * oversample, shape[1] * oversample),
+                (self.pixelscale[0] / oversample, self.pixelscale[1] / oversample),
+                1,
+                self.dtype,
+                self.device,
+            )
+            intensity = fine.image(intensity, {"blur": values["blur"]})
+        for effect in self.on_samples:
+            intensity = effect(intensity)
+        image = super().image(intensity, {k: v for k, v in values.items() if k != "blur"})
+        for effect in self.on_pixels:
+            image = effect(image)
+        return image

@@ -11,10 +11,11 @@ from pyklip_diffrender.pattern.choice import (
     ReferenceFrames,
     as_request,
     choose_systematics,
+    fit_with_pattern,
     pattern_for_visit,
+    place_on_detector,
     with_known_pattern,
 )
-from pyklip_diffrender.pattern.fit import fit_with_pattern
 from pyklip_diffrender.pattern.learn import learn_library
 from pyklip_diffrender.pattern.library import (
     PatternLibrary,
@@ -25,12 +26,12 @@ from pyklip_diffrender.pattern.library import (
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
+    lacks_pattern,
     learn_systematics,
     measure_patterns,
+    pattern_pedestal,
+    pattern_size,
 )
-from pyklip_diffrender.pattern.pedestal import pattern_pedestal
-from pyklip_diffrender.pattern.placement import place_on_detector
-from pyklip_diffrender.pattern.presence import lacks_pattern, pattern_size
 
 __all__ = [
     "MeasuredPattern",

@@ -23,31 +23,34 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     RefinementError,
 )
-from pyklip_diffrender.io.names import same_name, unknown_name
-from pyklip_diffrender.io.opd_map import OPDMap
+from pyklip_diffrender.io.headers import same_name, unknown_name
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.pattern.library import PatternLibrary, known_systematics
-from pyklip_diffrender.pattern.measure import flat_of, measure_patterns
-from pyklip_diffrender.pattern.pedestal import pattern_pedestal
-from pyklip_diffrender.pattern.presence import pattern_size
+from pyklip_diffrender.pattern.measure import (
+    flat_of,
+    measure_patterns,
+    pattern_pedestal,
+    pattern_size,
+)
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
-from pyklip_diffrender.scene.admission import frames_by_star, judge_frames
-from pyklip_diffrender.scene.archive_names import detector_of
-from pyklip_diffrender.scene.exposure import image_mask
-from pyklip_diffrender.scene.frame_files import (
+from pyklip_diffrender.scene.admission import (
     FrameFile,
     admissible,
     exclude_unusable,
     exposures_in,
+    frames_by_star,
+    judge_frames,
     require_some,
 )
+from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
+from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.scene.systematics import Systematics
-from pyklip_diffrender.wavefront.map_choice import wavefront_for
+from pyklip_diffrender.wavefront.opd import wavefront_for
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 __all__ = ["learn_library"]
 

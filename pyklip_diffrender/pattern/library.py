@@ -26,9 +26,8 @@ from pyklip_diffrender.io.files import (
     unpacked_name,
     write_fits,
 )
-from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.io.headers import fits_text, same_name
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.names import same_name
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
@@ -38,9 +37,7 @@ from pyklip_diffrender.pattern.measure import (
     measure_patterns,
 )
 from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.scene.archive_names import detector_of
-from pyklip_diffrender.scene.catalogue_star import star_of
-from pyklip_diffrender.scene.exposure import image_mask
+from pyklip_diffrender.scene.exposure import detector_of, image_mask, star_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics, pattern_fields, pattern_hdus
 

@@ -25,9 +25,15 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
-from pyklip_diffrender.io.opd_map import FLAT
-from pyklip_diffrender.wavefront.map_choice import RULES, Rule, choose_map, wavefront_for
-from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
+from pyklip_diffrender.wavefront.opd import (
+    RULES,
+    OPDMap,
+    Rule,
+    as_opd_map,
+    choose_map,
+    wavefront_for,
+)
+from pyklip_diffrender.wavefront.opd_map import FLAT
 
 if TYPE_CHECKING:
     from pyklip_diffrender.pattern import PatternLibrary

@@ -1,16 +1,21 @@
 """The frames of one wavelength of a pyKLIP dataset, with the recorded pixels where possible.
 
-The fit gets the pixels that the files recorded, see `recorded`, or those of ``dataset.input``.
+The fit gets the pixels that the files recorded, or those of ``dataset.input``.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import logging
+import os
 import warnings
-from collections.abc import Sequence
+from collections import abc
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
@@ -19,34 +24,753 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import (
+    CorruptFileError,
     DiffrenderWarning,
     IncompatibleSetupError,
     NoValidPixelsError,
     ShapeError,
 )
 from pyklip_diffrender.instrument.masks import FILTERS, detector_place
+from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.headers import fits_text, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64
-from pyklip_diffrender.pyklip_backend.admitted import admit
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings, settings_of
-from pyklip_diffrender.pyklip_backend.pointings import (
-    FrameDetails,
-    Pointing,
-    part_of,
-    pointings_of,
-)
-from pyklip_diffrender.pyklip_backend.recorded import NotRecordedError, recorded_frames
-from pyklip_diffrender.pyklip_backend.source import (
-    ATTRIBUTE,
-    SourceFrames,
-    attach_source,
-    why_without_source,
-)
-from pyklip_diffrender.scene.exposure import beginning
+from pyklip_diffrender.scene.admission import FrameFile
+from pyklip_diffrender.scene.exposure import beginning, is_reference, middle, star_of
+from pyklip_diffrender.scene.integrations import pointings
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, SHIFTS
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import Sequence
 
-__all__ = ["Frames", "date_of_frames", "frames_of", "observation_from_dataset", "require_frames"]
+__all__ = [
+    "ATTRIBUTE",
+    "REFERENCES",
+    "Admitted",
+    "FrameDetails",
+    "Frames",
+    "JudgedFiles",
+    "NotRecordedError",
+    "OpenedFile",
+    "Pointing",
+    "Recorded",
+    "SourceFrames",
+    "admit",
+    "attach_source",
+    "date_of_frames",
+    "frames_of",
+    "judged_before",
+    "keeping_references",
+    "keeping_source",
+    "library_files",
+    "observation_from_dataset",
+    "part_of",
+    "pointings_of",
+    "read_source",
+    "recorded_frames",
+    "require_frames",
+    "why_without_source",
+]
 
-logger = logging.getLogger(__name__)
+
+# The original pixels, errors, flags and headers of JWST files, which pyKLIP does not keep.
+#
+# `JWSTData.readdata` keeps the base name of each file and frames that a cubic spline has shifted to
+# the centre of the array. A wavefront fit needs the pixels as the detector recorded them, with
+# their errors. While the backend is registered, reading a dataset also attaches a `SourceFrames` to
+# it, and reading its library of reference stars attaches the paths of their files. A dataset that
+# was read before gets its `SourceFrames` from the files, if these can be found.
+
+_log = logging.getLogger(__name__)
+
+ATTRIBUTE = "_diffrender_source"
+"""Attribute of the dataset that holds its `SourceFrames`."""
+
+REASON = "_diffrender_no_source"
+"""Attribute of the dataset that says why it has no `SourceFrames`."""
+
+REFERENCES = "_diffrender_references"
+"""Attribute of the dataset with the paths of the files in its library of reference stars."""
+
+NON_SCIENCE = 512
+"""The one bit of the JWST data-quality flags that pyKLIP uses: it sets such pixels to NaN."""
+
+_ROUNDING = 1e-4
+"""Difference, relative to the brightest pixel, between two shifts of the same frame, one of them
+in single precision."""
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFrames:
+    """The N frames of a JWST dataset before pyKLIP shifted them, in the order of the dataset.
+
+    Frames that spaceKLIP has aligned are back on the pixels of the detector.
+
+    Attributes
+    ----------
+    headers : list of Header
+        One per frame: primary and SCI header merged.
+    data : ndarray, (N, ny, nx)
+        Pixels before resampling; NaN where the flags say NON_SCIENCE.
+    error : ndarray, (N, ny, nx), or None
+        Standard deviations from ERR, in the unit of `data`.
+    usable : ndarray of bool, (N, ny, nx)
+        False where a flag excludes the pixel from the fit.
+    centers : ndarray, (N, 2)
+        Star centres x, y in `data`, 0-indexed.
+    aligned : ndarray, (N, ny, nx)
+        Copy of ``dataset.input`` after reading: `data` shifted by pyKLIP.
+    aligned_centers : ndarray, (N, 2)
+        Copy of ``dataset.centers`` after reading.
+    filenames : tuple of str
+        ``dataset.filenames`` after reading.
+    first_pixels : list of (int, int) or None
+        Detector column and row of the first pixel of every frame, where known.
+    star_offsets : list of (float, float) or None
+        x, y of the star from the occulter as the file says, arcsec, where it does.
+    paths : list of Path
+        The file of every frame.
+    files : dict of Path to FrameFile
+        The files, as they were read.
+    sequence : Sequence or None
+        The sequence that the files were sorted into, if they were before pyKLIP read them.
+    """
+
+    headers: list[fits.Header]
+    data: NDArray[np.floating[Any]]
+    error: NDArray[np.float64] | None
+    usable: NDArray[np.bool_]
+    centers: NDArray[np.float64]
+    aligned: NDArray[np.floating[Any]]
+    aligned_centers: NDArray[np.float64]
+    filenames: tuple[str, ...]
+    first_pixels: list[tuple[int, int] | None]
+    star_offsets: list[tuple[float, float] | None]
+    paths: list[Path]
+    files: dict[Path, FrameFile]
+    sequence: Sequence | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
+        """Itself: it never changes, so copies of a dataset can share it."""
+        return self
+
+    @property
+    def pixelscale(self) -> float:
+        """Arcsec per pixel."""
+        return float(np.sqrt(self.headers[0]["PIXAR_A2"]))
+
+    def places(self, dataset: Any) -> NDArray[np.intp] | None:
+        """Return where the frames of a dataset are among these; None if one is not.
+
+        Frames of a dataset may have been left out, or put into another order.
+        """
+        # While products are written, names are as FITS headers can hold them.
+        names, read = (
+            [fits_text(name) for name in each] for each in (dataset.filenames, self.filenames)
+        )
+        if names == read:
+            return np.arange(len(names))
+        where = {name: k for k, name in reversed(list(enumerate(read)))}
+        if len(set(names)) < len(names) or not set(names) <= set(where):
+            return None
+        return np.array([where[name] for name in names])
+
+
+def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
+    """Wrap `JWSTData.readdata` so that it also attaches a `SourceFrames` to the dataset."""
+
+    def readdata_and_source(self: Any, filepaths: Any) -> None:
+        readdata(self, filepaths)
+        try:
+            setattr(self, ATTRIBUTE, read_source(self, filepaths))
+        except (KeyError, ValueError, OSError) as error:
+            # The dataset itself is complete without the source frames.
+            setattr(self, REASON, str(error))
+
+    readdata_and_source.__name__ = readdata.__name__
+    readdata_and_source.__doc__ = readdata.__doc__
+    return readdata_and_source
+
+
+def attach_source(dataset: Any, files: Any = None) -> None:
+    """Attach a `SourceFrames` to a `JWSTData` that was read before `register`, if possible.
+
+    Parameters
+    ----------
+    dataset : pyklip.instruments.Instrument.Data
+    files : path or sequence of path, optional
+        Files or folders in which the dataset's files are looked for by name, beside the current
+        folder.
+    """
+    if hasattr(dataset, ATTRIBUTE) or hasattr(dataset, REASON) or not _reads_files(dataset):
+        return
+    several = [files] if isinstance(files, str | os.PathLike) else list(files or ())
+    known: dict[str, str] = {}
+    for path in [Path(), *map(Path, several)]:
+        inside = path.iterdir() if path.is_dir() else [path]
+        known |= {each.name: str(each) for each in inside}
+    # pyKLIP appends the number of the integration to the name of the file.
+    names = list(dict.fromkeys(str(each).rpartition("_INT")[0] for each in dataset.filenames))
+    missing = [name for name in names if name not in known]
+    if missing:
+        return
+    try:
+        setattr(dataset, ATTRIBUTE, read_source(dataset, [known[n] for n in names], late=True))
+    except (KeyError, ValueError, OSError) as error:
+        setattr(dataset, REASON, str(error))
+    else:
+        _log.info("the files of the dataset were read again: it was made before register()")
+
+
+def why_without_source(dataset: Any) -> str | None:
+    """Return why errors and original pixels of a dataset's files are not known.
+
+    None for a dataset that has them, or was not read from files.
+    """
+    if hasattr(dataset, ATTRIBUTE) or not _reads_files(dataset):
+        return None
+    reason = getattr(dataset, REASON, None)
+    if reason is not None:
+        return str(reason)
+    return (
+        "the dataset was made before register() or the backend block. Make it after that, or say "
+        "where its files are: DiffrenderSettings(files=...)"
+    )
+
+
+def _reads_files(dataset: Any) -> bool:
+    """Whether a dataset is a `JWSTData`, which has read files."""
+    return hasattr(dataset, "center_include_offset") and hasattr(dataset, "center_kw_x")
+
+
+def read_source(
+    dataset: Any, filepaths: str | Iterable[str], *, late: bool = False
+) -> SourceFrames:
+    """Read the pixels, errors, flags and headers of the files of a `JWSTData`.
+
+    Parameters
+    ----------
+    dataset : JWSTData
+    filepaths : str or iterable of str
+    late : bool
+        The dataset was not just filled: its frames may have been changed, left out or reordered
+        since, so that all frames are shifted again.
+
+    Raises
+    ------
+    ValueError
+        If shifting these pixels as pyKLIP does not reproduce ``dataset.input``.
+    """
+    from pyklip.klip import align_and_scale
+
+    paths = [filepaths] if isinstance(filepaths, str) else list(filepaths)
+    files = [_read(path, dataset) for path in paths]
+    counts = [len(file.data) for file in files]
+    middle = (np.array(files[0].data.shape[:0:-1]) - 1) / 2.0
+
+    def shifted(file: _File, frame: int) -> NDArray[np.float64]:
+        return np.asarray(
+            align_and_scale(file.as_read[frame], new_center=middle, old_center=file.center_read)
+        )
+
+    aligned, centers = np.array(dataset.input), np.array(dataset.centers)
+    names = tuple(str(name) for name in dataset.filenames)
+    if late:
+        aligned = np.array([shifted(f, k) for f in files for k in range(len(f.data))], np.float32)
+        centers = np.tile(middle, (len(aligned), 1))
+        names = tuple(
+            f"{Path(path).name}_INT{k + 1}"
+            for path, n in zip(paths, counts, strict=True)
+            for k in range(n)
+        )
+    judged = _JUDGED.get()
+    source = SourceFrames(
+        headers=[file.header for file, n in zip(files, counts, strict=True) for _ in range(n)],
+        data=np.concatenate([file.data for file in files]),
+        error=None
+        if any(file.error is None for file in files)
+        else np.concatenate([file.error for file in files if file.error is not None]),
+        usable=np.concatenate([file.usable for file in files]),
+        centers=np.concatenate([file.centers for file in files]),
+        aligned=aligned,
+        aligned_centers=centers,
+        filenames=names,
+        first_pixels=[f.first_pixel for f, n in zip(files, counts, strict=True) for _ in range(n)],
+        star_offsets=[f.star_offset for f, n in zip(files, counts, strict=True) for _ in range(n)],
+        paths=[f.file.path for f, n in zip(files, counts, strict=True) for _ in range(n)],
+        files={each.file.path: each.file for each in files},
+        sequence=None if judged is None else judged.sequence,
+    )
+    if not late:
+        same_shape = source.data.shape == aligned.shape
+        if not same_shape or not _is_close(shifted(files[0], 0), aligned[0]):
+            raise ValueError(f"{paths[0]}: pyKLIP shifted these frames in a way not known here")
+    return source
+
+
+def _is_close(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Whether two frames differ by no more than rounding."""
+    scale = np.max(np.abs(other), where=np.isfinite(other), initial=0.0)
+    return np.allclose(one, other, rtol=0.0, atol=_ROUNDING * scale, equal_nan=True)
+
+
+class _File(NamedTuple):
+    """The frames of one file; see `SourceFrames`."""
+
+    file: FrameFile
+    header: fits.Header
+    data: NDArray[np.floating[Any]]
+    error: NDArray[np.float64] | None
+    usable: NDArray[np.bool_]
+    centers: NDArray[np.float64]
+    first_pixel: tuple[int, int] | None
+    star_offset: tuple[float, float] | None
+    as_read: NDArray[Any]
+    """The frames, and their star's x, y, as pyKLIP reads them."""
+    center_read: NDArray[np.float64]
+
+
+class OpenedFile(NamedTuple):
+    """What a file holds, for `reduce` and as pyKLIP reads it."""
+
+    file: FrameFile
+    primary: fits.Header
+    science: fits.Header
+    pixels: NDArray[Any]
+    flags: NDArray[Any]
+    aligned: bool
+
+    @classmethod
+    def at(cls, path: str | os.PathLike[str]) -> OpenedFile:
+        """Open a file, once.
+
+        Raises
+        ------
+        CorruptFileError, KeyError
+            If it cannot be read, or has no SCI extension.
+        """
+        where = Path(path).absolute()
+        with open_fits(where) as hdus:
+            return cls(
+                FrameFile.in_hdus(hdus, where, frames=True),
+                hdus[0].header,
+                hdus["SCI"].header,
+                hdus["SCI"].data,
+                hdus["DQ"].data if "DQ" in hdus else np.zeros((), np.uint32),
+                any(name in hdus for name in SHIFTS),
+            )
+
+
+class JudgedFiles(NamedTuple):
+    """Files that were opened and judged before pyKLIP reads them, by path."""
+
+    files: Mapping[Path, OpenedFile]
+    sequence: Sequence
+
+
+_JUDGED: ContextVar[JudgedFiles | None] = ContextVar("judged", default=None)
+
+
+@contextmanager
+def judged_before(files: JudgedFiles) -> Iterator[None]:
+    """Take files that were opened already for datasets that are read inside."""
+    token = _JUDGED.set(files)
+    try:
+        yield
+    finally:
+        _JUDGED.reset(token)
+
+
+def _read(path: str, dataset: Any) -> _File:
+    """Read one file as `reduce` does, for the star's position that pyKLIP has read."""
+    judged = _JUDGED.get()
+    known = None if judged is None else judged.files.get(Path(path).absolute())
+    file, primary, science, pixels, flags, aligned = known or OpenedFile.at(path)
+    header = merged_header(primary, science, path)
+    as_read = np.array(pixels)
+    as_read = as_read[np.newaxis] if as_read.ndim == 2 else as_read
+    flags = np.broadcast_to(flags, as_read.shape)
+    as_read[(flags & NON_SCIENCE) != 0] = np.nan
+    # As pyKLIP finds the centre: the given keywords, else CRPIX, plus the dither if requested.
+    keywords = (dataset.center_kw_x, "CRPIX1"), (dataset.center_kw_y, "CRPIX2")
+    center = np.array([science.get(key, science.get(other)) - 1 for key, other in keywords], float)
+    if dataset.center_include_offset:
+        offset = np.array([primary["XOFFSET"], primary["YOFFSET"]])
+        center += offset / np.sqrt(science["PIXAR_A2"])
+    centers = np.tile(center, (len(as_read), 1))
+    frames = file.frames
+    if isinstance(frames, CorruptFileError | NoValidPixelsError):
+        # Such as a file without errors, or a frame of which all pixels are flagged.
+        _log.warning("only the pixels and flags are used: %s", frames)
+        usable = (flags & BAD_PIXEL_BITS) == 0
+        return _File(file, header, as_read, None, usable, centers, None, None, as_read, center)
+    if not isinstance(frames, Observation):
+        raise frames or CorruptFileError(f"{path}: no frames")
+    if aligned:
+        # Frames are back on the pixels of the detector, so that flat-field errors are, too.
+        stated = [
+            header.get(f"STARCEN{axis}", header.get(f"CRPIX{k}"))
+            for k, axis in ((1, "X"), (2, "Y"))
+        ]
+        centers += frames.center - (np.array(stated, dtype=float) - 1)
+    # The gaps of frames that are put back are where they were before the shift.
+    seen = frames.valid if aligned else np.isfinite(as_read)
+    return _File(
+        file,
+        header,
+        np.where(seen, frames.data, np.nan),
+        np.where(frames.valid, frames.error, 0.0),
+        frames.valid,
+        centers,
+        frames.first_pixel,
+        frames.star_offset,
+        as_read,
+        center,
+    )
+
+
+def keeping_references(readpsflib: Callable[..., None]) -> Callable[..., None]:
+    """Wrap `JWSTData.readpsflib` so that the dataset also knows the paths of the files."""
+
+    def readpsflib_and_paths(self: Any, psflib_filepaths: Any, *args: Any, **kw: Any) -> None:
+        readpsflib(self, psflib_filepaths, *args, **kw)
+        several = [psflib_filepaths] if isinstance(psflib_filepaths, str) else psflib_filepaths
+        setattr(self, REFERENCES, tuple(str(Path(path).resolve()) for path in several))
+
+    readpsflib_and_paths.__name__ = readpsflib.__name__
+    readpsflib_and_paths.__doc__ = readpsflib.__doc__
+    return readpsflib_and_paths
+
+
+# The pixels that the files of a `JWSTData` recorded, with what was added to the dataset since.
+#
+# The frames in ``dataset.input`` of a `JWSTData` were shifted to the centre of the array when they
+# were read, which correlates their noise and makes sharp speckles ring. Where the recorded frames
+# are known, the fit gets those, plus whatever was added to ``dataset.input`` since (an injected
+# companion, for example). Only the subtracted frames are then shifted.
+
+_SINGLE_PRECISION = 1e-5
+"""Relative difference of pixels that single precision explains."""
+
+
+class NotRecordedError(Exception):
+    """The recorded pixels are not those of the dataset, for the reason that the message gives."""
+
+
+class Recorded(NamedTuple):
+    """Recorded pixels with what was added to the dataset since, (n, ny, nx), and their star."""
+
+    data: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    error: NDArray[np.float64] | None
+    centers: NDArray[np.float64]
+    factor: NDArray[np.float64]
+
+
+def recorded_frames(
+    source: SourceFrames,
+    places: NDArray[np.intp] | None,
+    dataset: Any,
+    index: NDArray[np.intp],
+    imgs: NDArray[np.float64],
+) -> Recorded:
+    """Recorded pixels plus what was added to `imgs` since reading, in the unit of the files.
+
+    Raises
+    ------
+    NotRecordedError
+        If no recorded pixels correspond to those of the dataset.
+    """
+    from pyklip.klip import align_and_scale
+
+    if places is None:
+        raise NotRecordedError("its frames are not those that were read, by their names")
+    if imgs.shape[1:] != source.aligned.shape[1:]:
+        ny, nx = source.aligned.shape[1:]
+        raise NotRecordedError(
+            f"its frames have {imgs.shape[2]} x {imgs.shape[1]} pixels, and had {nx} x {ny} when "
+            "they were read"
+        )
+    rows = places[index]
+    before = native_float64(source.aligned[rows])
+    factor = np.array([_factor(one, other) for one, other in zip(imgs, before, strict=True)])
+    # Pixels that were NaN when they were read belong to flagged ones, whatever was filled in.
+    change = np.where(np.isfinite(before), imgs / factor[:, None, None] - before, 0.0)
+    data = native_float64(source.data[rows])
+    error = None if source.error is None else native_float64(source.error[rows])
+    if error is not None:
+        _require_same(change, error, source.usable[rows])
+    valid = source.usable[rows] & np.isfinite(data)
+    centers = native_float64(dataset.centers)[index]
+    moved = centers - source.aligned_centers[rows]
+    for i, frame in enumerate(rows):
+        shift = {"new_center": source.centers[frame], "old_center": source.aligned_centers[frame]}
+        masked = np.isnan(imgs[i]) & np.isfinite(before[i])
+        added = np.where(np.isfinite(change[i]), change[i], 0.0)
+        # A changed factor is known to the rounding of single precision.
+        peak = np.max(np.abs(before[i]), where=np.isfinite(before[i]), initial=0.0)
+        if np.abs(added).max() > _SINGLE_PRECISION * peak:
+            # Nothing is known beyond the edge of the shifted frame; assume nothing was added.
+            data[i] += np.nan_to_num(align_and_scale(added, **shift))
+        if masked.any():
+            # A pixel masked by hand invalidates every recorded pixel that contributed to it.
+            valid[i] &= np.nan_to_num(align_and_scale(masked.astype(float), **shift)) < 0.1
+    return Recorded(data, valid, error, source.centers[rows] + moved, factor)
+
+
+def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
+    """Factor by which a frame was multiplied since it was read; 1 if it was not.
+
+    Raises
+    ------
+    NotRecordedError
+        If it is not positive.
+    """
+    known = np.isfinite(before) & np.isfinite(now)
+    if not known.any():
+        return 1.0
+    with np.errstate(invalid="ignore"):
+        bright = known & (np.abs(before) > np.percentile(np.abs(before[known]), 90))
+    if not bright.any():
+        return 1.0
+    ratios = now[bright] / before[bright]
+    factor = float(np.median(ratios))
+    # Sources that were added since change few of the brightest pixels.
+    if abs(factor - 1) < _SINGLE_PRECISION or np.median(
+        np.abs(ratios - factor)
+    ) > _SINGLE_PRECISION * abs(factor):
+        return 1.0
+    if factor <= 0:
+        raise NotRecordedError(f"its frames were multiplied by {factor:.3g} after reading")
+    return factor
+
+
+def _require_same(
+    change: NDArray[np.float64], error: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> None:
+    """Refuse frames in which most pixels were changed by more than their noise.
+
+    Faint sources change few pixels, and another background changes all by the same amount.
+
+    Raises
+    ------
+    NotRecordedError
+    """
+    for frame, sigma, good in zip(change, error, usable, strict=True):
+        known, scale = frame[np.isfinite(frame)], sigma[good & (sigma > 0)]
+        if not known.size or not scale.size:
+            continue
+        spread = float(np.median(np.abs(known - np.median(known))))
+        if spread > float(np.median(scale)):
+            raise NotRecordedError(
+                "most of its pixels were changed by more than their noise after reading, for "
+                "example by a filter"
+            )
+
+
+# Files of a dataset and of its library of reference stars, judged as `Sequence` judges files.
+
+
+class Admitted(NamedTuple):
+    """Frames of a dataset that are used, and what else its files say.
+
+    Attributes
+    ----------
+    target : ndarray of bool, (n,)
+        Frames of the target.
+    references : tuple of Observation
+        Of reference stars, from the dataset and the library.
+    """
+
+    target: NDArray[np.bool_]
+    references: tuple[Observation, ...]
+
+
+def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
+    """Files of the frames in a PSF library, as far as they are known.
+
+    Only a library that `JWSTData` read while the backend was registered has files.
+    """
+    paths = [Path(path) for path in getattr(dataset, REFERENCES, ())]
+    chosen = np.asarray(psf_library.master_filenames)
+    if psf_library.isgoodpsf is not None:
+        chosen = chosen[psf_library.isgoodpsf]
+    # pyKLIP appends the number of the integration to the name of the file.
+    names = {str(name).rpartition("_INT")[0] for name in chosen}
+    return tuple(path for path in paths if path.name in names)
+
+
+def admit(source: SourceFrames, frames: NDArray[np.intp], library: abc.Sequence[Path]) -> Admitted:
+    """Judge the files of frames of one filter, and those of the library.
+
+    The target is the star of the first frame that is not marked as a reference (IS_PSF).
+
+    Parameters
+    ----------
+    source : SourceFrames
+    frames : ndarray of int
+        Indices in `source`.
+    library : sequence of Path
+        Files of reference stars.
+
+    Raises
+    ------
+    IncompatibleSetupError, NoValidPixelsError
+        See `pyklip_diffrender.Sequence.from_files`.
+
+    Warns
+    -----
+    DiffrenderWarning
+        For every file that is not used, or not entirely, with the reason.
+    """
+    paths = [source.paths[k] for k in frames]
+    sequence = source.sequence
+    known = sequence is not None
+    if sequence is None:
+        sequence = _sequence(source, frames, paths, library)
+    others = {str(each.get("FILTER")) for each in source.headers} - {str(sequence.filter)}
+    for row in sequence.rows:
+        if known and row.use == "excluded":
+            continue  # Whoever has judged the files has said so.
+        if row.remark and row.exposure.filter not in others:
+            what = "is not used: " if row.use == "excluded" else ""
+            warnings.warn(
+                f"{row.exposure.name}: {what}{row.remark}", DiffrenderWarning, stacklevel=2
+            )
+    uses = {row.path: row.use for row in sequence.rows if row.use != "excluded"}
+    names = [(path, source.filenames[k]) for path, k in zip(paths, frames, strict=True)]
+    again = [each in names[:k] for k, each in enumerate(names)]
+    if any(again):
+        warnings.warn(
+            f"{sum(again)} frames are in the dataset twice, and are used once",
+            DiffrenderWarning,
+            stacklevel=2,
+        )
+    marked = sum(uses.get(path) == "reference" for path in paths)
+    if marked:
+        warnings.warn(
+            f"{marked} of {len(paths)} frames of the dataset show a reference star and stay NaN in "
+            "the products. Give them to JWSTData as psflib_filepaths",
+            DiffrenderWarning,
+            stacklevel=2,
+        )
+    used = [uses.get(path) == "target" and not a for path, a in zip(paths, again, strict=True)]
+    return Admitted(np.array(used), sequence.references)
+
+
+def _sequence(
+    source: SourceFrames,
+    frames: NDArray[np.intp],
+    paths: abc.Sequence[Path],
+    library: abc.Sequence[Path],
+) -> Sequence:
+    """Sort the files of frames, and those of the library, none of which is opened twice."""
+    headers = [source.headers[k] for k in frames]
+    first = next((k for k, h in enumerate(headers) if not is_reference(h)), 0)
+    name = source.filenames[frames[first]]
+    return Sequence.of_opened(
+        # Copies, into which the reasons are written.
+        [replace(source.files[path]) for path in dict.fromkeys(paths)],
+        [FrameFile.opened(path, frames=True) for path in library],
+        target=next(iter(star_of(headers[first], name).names), None),
+        filter=header_text(headers[first], "FILTER", name),
+    )
+
+
+# Pointings: frames that show the star at one place and orientation, averaged for the fit.
+
+
+class FrameDetails(NamedTuple):
+    """Details of one frame, from its file, that an `Observation` of several does not hold."""
+
+    file: str
+    header: fits.Header
+    first_pixel: tuple[int, int] | None = None
+    star_offset: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Pointing:
+    """Frames that show the star at one place and orientation.
+
+    Attributes
+    ----------
+    frames : ndarray of int
+        Their indices among the fitted frames.
+    observation : Observation
+        These frames, with the header of the first.
+    """
+
+    frames: NDArray[np.intp]
+    observation: Observation
+
+    def __repr__(self) -> str:
+        return f"<Pointing: frames {', '.join(map(str, self.frames))} of {self.observation.name!r}>"
+
+
+def part_of(observation: Observation, which: NDArray[np.intp] | NDArray[np.bool_]) -> Observation:
+    """Some frames of an observation, chosen by an index array or a mask."""
+    angles = observation.position_angles
+    return dataclasses.replace(
+        observation,
+        data=observation.data[which],
+        error=observation.error[which],
+        valid=observation.valid[which],
+        center=observation.center[which],
+        position_angles=None if angles is None else angles[which],
+    )
+
+
+def pointings_of(
+    observation: Observation, details: abc.Sequence[FrameDetails] | None = None
+) -> list[Pointing]:
+    """Sort the frames of an observation by file and by where they show the star.
+
+    The rule is that of `Observation.pointings`. As in a `Sequence`, the pointings are in order of
+    time.
+
+    Parameters
+    ----------
+    observation : Observation
+        Several pointings.
+    details : sequence of FrameDetails, optional
+        One for each frame; by default all frames are as if from one file.
+    """
+    known = observation.position_angles
+    if details is None:
+        groups = list(pointings(observation.center, known))
+        return [Pointing(group, _at_one_place(observation, group)) for group in groups]
+    files: dict[str, list[int]] = {}
+    for k, each in enumerate(details):
+        files.setdefault(each.file, []).append(k)
+    made = []
+    for file, rows in files.items():
+        inside = np.array(rows)
+        angles = None if known is None else known[inside]
+        groups = [inside[each] for each in pointings(observation.center[inside], angles)]
+        for k, group in enumerate(groups, 1):
+            first = details[group[0]]
+            part = dataclasses.replace(
+                _at_one_place(observation, group),
+                name=file if len(groups) == 1 else f"{file} (pointing {k})",
+                header=first.header,
+                date=beginning(first.header, file),
+                mid_date=middle(first.header, file),
+                first_pixel=first.first_pixel,
+                star_offset=first.star_offset,
+            )
+            made.append(Pointing(group, part))
+    return sorted(
+        made, key=lambda each: 0.0 if each.observation.date is None else each.observation.date.mjd
+    )
+
+
+def _at_one_place(observation: Observation, group: NDArray[np.intp]) -> Observation:
+    """Some frames, with their star at one place: what is averaged has one star."""
+    part = part_of(observation, group)
+    return dataclasses.replace(part, center=np.tile(part.center.mean(axis=0), (len(group), 1)))
+
+
+# The frames of one wavelength of a pyKLIP dataset, with the recorded pixels where possible.
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +893,7 @@ def frames_of(
     index: NDArray[np.intp],
     imgs: NDArray[Any],
     settings: DiffrenderSettings,
-    library: Sequence[Path] = (),
+    library: abc.Sequence[Path] = (),
 ) -> Frames:
     """Gather the target's frames of one wavelength with their errors, masks and metadata.
 
@@ -315,7 +1039,7 @@ def _usable(valid: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:
             "the DQ flags (bits 1 and 512) and at the ERR extension"
         )
     if not usable.all():
-        logger.warning(
+        _log.warning(
             "%s: %d of %d frames have no valid pixel and stay NaN",
             name, int((~usable).sum()), len(usable),
         )  # fmt: skip

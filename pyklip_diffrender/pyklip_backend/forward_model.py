@@ -9,22 +9,38 @@ of the fit loses nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.headers import set_keyword
+from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
+from pyklip_diffrender.pyklip_backend.klip_call import DatasetReduction, fill
+from pyklip_diffrender.pyklip_backend.subtract import FittedPointing, Subtraction
+from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
+    from pyklip_diffrender.detection.error_factor import ErrorFactor
     from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["PlanetInFrame", "check_forward_model", "is_planet", "planet_in_frames"]
+__all__ = [
+    "ForwardReduction",
+    "PlanetInFrame",
+    "check_forward_model",
+    "is_planet",
+    "planet_cards",
+    "planet_in_frames",
+]
+
 
 Filter = Callable[[NDArray[Any]], NDArray[Any]]
 
@@ -263,3 +279,238 @@ def _is_companion(result: Refinement, part: FittedPointing, source: _PlanetImage
     # Companions are relative to the fitted star in the first frame, as are the parts.
     offset = part.from_star(source.offset)
     return bool((np.hypot(*(result.companions[:, 1:] - offset).T) < part.resolution).any())
+
+
+# The planet of a forward model as the linear model of the fit measures it.
+#
+# A fit of the product, such as `pyklip.fitpsf.FMAstrometry`, has to estimate the noise from an
+# annulus about the star. The linear model knows the noise of every pixel and the self-subtraction,
+# so that its values are more precise and its errors are those of the values.
+
+_log = logging.getLogger(__name__)
+
+
+def planet_cards(
+    part: FittedPointing,
+    planet: PlanetInFrame,
+    angle: float,
+    flipx: bool,
+    error_factor: ErrorFactor | None = None,
+) -> fits.Header:
+    """Flux and position of a planet with their errors, as cards for the products.
+
+    Parameters
+    ----------
+    part : FittedPointing
+        The pointing of the fit's first frame.
+    planet : PlanetInFrame
+        The forward model there.
+    angle : float
+        Degrees counter-clockwise by which pyKLIP turns the pointing.
+    flipx : bool
+        See `pyklip.klip.rotate`.
+    error_factor : ErrorFactor, optional
+        By how much the errors are too small. By default it is measured with the planet, and the
+        companions of the fit, removed.
+
+    Returns
+    -------
+    Header
+        Empty if no source is within lambda/D of the planet's place in the forward model.
+    """
+    from pyklip_diffrender.detection.candidates import (
+        Candidates,
+        calibration_errors,
+        refine_candidates,
+        with_position_of_star,
+    )
+    from pyklip_diffrender.detection.search import default_factor
+    from pyklip_diffrender.detection.templates import groups_of
+
+    cards = fits.Header()
+    start, resolution = part.from_star(planet.offset), part.resolution
+    others = Candidates.of_fit(part.result)
+    for k in reversed(range(len(others))):
+        if np.hypot(*(others.offsets[k].numpy() - start)) < resolution:
+            others = others.without(k)
+    groups = groups_of([part.result])
+    sources = refine_candidates(
+        groups, others.with_one_more(start, planet.contrast), resolution / 2
+    )
+    moved = sources.offsets[-1].numpy() - start
+    flux = float(sources.contrasts[-1]) / planet.contrast
+    if not (np.hypot(*moved) < resolution and flux > 0):
+        _log.info("no source within lambda/D of the planet of the forward model")
+        return cards
+    sources = with_position_of_star(groups, sources)
+    covariance = sources.covariance.numpy().reshape(3, len(sources), 3, len(sources))[:, -1, :, -1]
+    if error_factor is None:
+        error_factor = default_factor([part.result], groups, sources)
+    factor = float(error_factor.of(sources.offsets[-1:])[0])
+    error = factor * np.sqrt(covariance[0, 0])
+    snr = sources.contrasts.new_tensor(sources.snr(error_factor)[-1:])
+    factors = snr.new_full(snr.shape, factor)
+    calibration = float(calibration_errors(groups, sources.offsets[-1:], snr, factors)[1, 0])
+    detector = part.frame.model.detector
+    # From arcsec along x and y to pixels, then as pyKLIP turns the frames; east is to the left.
+    pixels = np.linalg.inv([[1.0, 0.0], [detector.shear, 1.0]])
+    pixels /= np.array(detector.pixelscale)[:, np.newaxis]
+    turn = rotation_matrix(angle)
+    turn[0] *= 1 if flipx else -1
+    place = turn @ (planet.offset + pixels @ moved)
+    jacobian = turn @ pixels
+    deviations = factor * np.sqrt(np.diag(jacobian @ covariance[1:, 1:] @ jacobian.T))
+    set_keyword(cards, "DRFMFLUX", flux)
+    flux_error = float(np.hypot(error / planet.contrast, flux * calibration))
+    set_keyword(cards, "DRFMFERR", flux_error)
+    set_keyword(cards, "DRFMFACT", factor)
+    for axis, value, deviation in zip(("RA", "DE"), place, deviations, strict=True):
+        set_keyword(cards, f"DRFM{axis}", float(value))
+        set_keyword(cards, f"DRFM{axis}ER", float(deviation))
+    return cards
+
+
+# One call of `pyklip.fm.klip_dataset` in which the star is rendered.
+#
+# As for `parallelized.klip_dataset`, pyKLIP checks the arguments, collapses, and writes the files.
+# Its `klip_parallelized` of `pyklip.fm` also turns the frames to north.
+
+
+class ForwardReduction(DatasetReduction):
+    """A call of `pyklip.fm.klip_dataset` for this backend; see `DatasetReduction`."""
+
+    def __init__(self, arguments: Mapping[str, Any], settings: DiffrenderSettings) -> None:
+        super().__init__(arguments, settings)
+        self.fm_class = arguments["fm_class"]
+        self._planet_cards = fits.Header()
+
+    def _check(self) -> None:
+        check_forward_model(self.fm_class, self.settings)
+        super()._check()
+
+    def _image(self, subtraction: Subtraction) -> str:
+        """Return "subtracted": the forward model is that of a planet in the frames minus star."""
+        return "subtracted"
+
+    @property
+    def _verbose(self) -> bool:
+        return not self.arguments["mute_progression"]
+
+    def _write_extras(self, stage: Path, prefix: str, cards: fits.Header) -> None:
+        """Add what the fit says of the planet; the forward model says how much is left of it."""
+        cards.extend(self._planet_cards)
+
+    def _in_place_of_klip(
+        self,
+        opd: OPDMap,
+        imgs: NDArray[Any],
+        centers: NDArray[Any],
+        parangs: NDArray[Any],
+        wvs: NDArray[Any],
+        IWA: float,
+        *args: Any,
+        **kw: Any,
+    ) -> tuple[Any, ...]:
+        """Replace `pyklip.fm.klip_parallelized`.
+
+        Returns
+        -------
+        sub_imgs : ndarray
+            (b, n, ny, nx), turned to north; one equal slice for each entry of numbasis.
+        fmout : ndarray or None
+            The planet in them, likewise.
+        perturbmag : ndarray or None
+            (n, b) largest change of the star because of the planet, over the standard deviation of
+            the star.
+        aligned_center : sequence
+            [x, y] of their common centre.
+        noise : ndarray
+            (b, n, ny, nx) if requested, else ``[1.]``.
+        """
+        unturned, center, noise = self._klip_parallelized(
+            opd, imgs, centers, parangs, wvs, np.arange(len(imgs)), IWA, **kw
+        )
+        cube = _turned(unturned[0], parangs, center, kw["flipx"])
+        hidden, count = np.isnan(cube), len(unturned)
+        if noise.ndim > 1:
+            noise = _repeated(_turned(noise[0], parangs, center, kw["flipx"]), hidden, count)
+        fmout, perturbmag = None, None
+        if is_planet(self.fm_class):
+            planets, taken = self._planets(imgs.shape, parangs, wvs, np.array(center), kw["flipx"])
+            # The spline that turns frames depends on which pixels are masked.
+            planets[np.isnan(unturned[0])] = np.nan
+            turned = _turned(planets, parangs, center, kw["flipx"])
+            fmout = _repeated(turned.astype(unturned.dtype), hidden, count)
+            perturbmag = np.repeat(taken[:, np.newaxis], count, axis=1)
+        return (
+            _repeated(cube.astype(unturned.dtype), hidden, count),
+            fmout,
+            perturbmag,
+            center,
+            noise,
+        )
+
+    def _planets(
+        self,
+        shape: tuple[int, ...],
+        parangs: NDArray[Any],
+        wvs: NDArray[Any],
+        center: NDArray[np.float64],
+        flipx: bool,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The planet in all frames (n, ny, nx), star at `center`, and how much the star took.
+
+        Its image goes through all steps that the frames went through.
+        """
+        from pyklip.klip import align_and_scale
+
+        self._tell("forward model of the planet")
+        images, taken = np.full(shape, np.nan), np.full(shape[0], np.nan)
+        for record, wave in zip(self.records, np.unique(wvs), strict=True):
+            frames = np.flatnonzero(wvs == wave)[record.frames.usable]
+            planets = planet_in_frames(
+                self.fm_class,
+                record.subtraction.pointings,
+                frames,
+                parangs[frames],
+                wave,
+                flipx,
+                self._filter,
+            )
+            if len(self.records) == 1:
+                first = next(part for part in record.subtraction.pointings if part.index == 0)
+                k, reduction = int(first.pointing.frames[0]), record.subtraction.reduction
+                self._planet_cards = planet_cards(
+                    first,
+                    replace(planets[k], contrast=planets[k].contrast / record.frames.factor[k]),
+                    parangs[frames[k]],
+                    flipx,
+                    None if reduction is None else reduction.detection.error_factor,
+                )
+            for k, planet in planets.items():
+                fill(planet.left, record.frames.observation.valid[k])
+                image = planet.left if self._filter is None else self._filter(planet.left)
+                images[frames[k]] = align_and_scale(
+                    image, new_center=center, old_center=planet.center
+                )
+                taken[frames[k]] = planet.taken
+        return images, taken
+
+
+def _turned(
+    frames: NDArray[Any], angles: NDArray[Any], center: Any, flipx: bool
+) -> NDArray[np.float64]:
+    """Frames turned to north by pyKLIP."""
+    from pyklip.klip import rotate
+
+    return np.array(
+        [
+            rotate(np.asarray(frame, dtype=np.float64), angle, center, flipx=flipx)
+            for frame, angle in zip(frames, angles, strict=True)
+        ]
+    )
+
+
+def _repeated(frames: NDArray[Any], hidden: NDArray[np.bool_], count: int) -> NDArray[Any]:
+    """Equal slices (count, n, ny, nx), NaN where the subtracted frames are."""
+    return np.repeat(np.where(hidden, np.nan, frames)[np.newaxis], count, axis=0)

@@ -7,64 +7,387 @@ interface, and `high_pass_filter_imgs` by one that keeps the unfiltered frames f
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
+import inspect
 import io
 import logging
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from astropy.io import fits
+from astropy.stats import sigma_clipped_stats
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import (
     DiffrenderWarning,
     IncompatibleSetupError,
+    NoValidPixelsError,
     RefinementError,
     ShapeError,
 )
-from pyklip_diffrender.io.headers import fits_text
-from pyklip_diffrender.io.keywords import set_keyword
-from pyklip_diffrender.pyklip_backend.admitted import library_files
+from pyklip_diffrender.io.headers import fits_text, set_keyword
 from pyklip_diffrender.pyklip_backend.backend_settings import (
     DiffrenderSettings,
     starting_opd,
     thread_limit,
 )
-from pyklip_diffrender.pyklip_backend.checks import (
-    check_arguments,
-    check_dataset,
-    check_settings,
-)
-from pyklip_diffrender.pyklip_backend.dataset_frames import Frames, date_of_frames, frames_of
-from pyklip_diffrender.pyklip_backend.injections import subtract_from_copy
-from pyklip_diffrender.pyklip_backend.klip_frames import (
-    aligned_before,
-    annuli_of,
-    fill,
-    noise_cube,
-    place,
-    slices,
+from pyklip_diffrender.pyklip_backend.dataset_frames import (
+    ATTRIBUTE,
+    Frames,
+    attach_source,
+    date_of_frames,
+    frames_of,
+    library_files,
+    require_frames,
 )
 from pyklip_diffrender.pyklip_backend.output_files import (
+    IMAGES,
     ReductionRecord,
     folder_and_prefix,
+    image_of,
     provenance,
     staging,
     stamp,
+    throughput_map,
+    write_throughput,
 )
-from pyklip_diffrender.pyklip_backend.product_images import image_of
-from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE, attach_source
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
-from pyklip_diffrender.pyklip_backend.throughput import throughput_map, write_throughput
 from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["RESULTS", "DatasetReduction", "mark_filtered"]
+__all__ = [
+    "RESULTS",
+    "Annuli",
+    "DatasetReduction",
+    "aligned_before",
+    "annuli_of",
+    "check_arguments",
+    "check_dataset",
+    "check_settings",
+    "fill",
+    "mark_filtered",
+    "noise_cube",
+    "place",
+    "slices",
+    "subtract_from_copy",
+]
 
-logger = logging.getLogger(__name__)
+
+# Place and mask subtracted frames the way pyKLIP's `klip_parallelized` does.
+
+
+@dataclass(frozen=True)
+class Annuli:
+    """The annuli that pyKLIP would use, reduced to what matters without KLIP.
+
+    Attributes
+    ----------
+    inner, outer : float
+        Pixels; r < inner and r >= outer are NaN in a product.
+    width : float
+        Width in pixels of the narrowest annulus, over which pyKLIP measures noise.
+    """
+
+    inner: float
+    outer: float
+    width: float
+
+
+def annuli_of(
+    imgs: NDArray[Any],
+    centers: NDArray[Any],
+    inner: float,
+    outer: float | None,
+    annuli: int | Sequence[tuple[float, float]],
+    spacing: str,
+) -> Annuli:
+    """Find the annuli of frames (n, ny, nx) by pyKLIP's rules.
+
+    Parameters
+    ----------
+    imgs : ndarray, (n, ny, nx)
+    centers : ndarray, (n, 2)
+        Star centres x, y.
+    inner, outer : float
+        IWA and OWA in pixels; `outer` is None for the whole image.
+    annuli : int or sequence of (inner, outer)
+        Number of annuli, or their radii in pixels.
+    spacing : str
+        "constant", "log" or "linear".
+    """
+    from pyklip.klip import define_annuli_bounds
+
+    if np.ndim(annuli):
+        inners, outers = np.array(annuli, dtype=float).reshape(-1, 2).T
+        return Annuli(inners.min(), outers.max(), (outers - inners).min())
+    edge = outer
+    if edge is None:
+        y, x = np.indices(imgs.shape[1:])
+        squared = (x - centers[0][0]) ** 2 + (y - centers[0][1]) ** 2
+        bad = np.isnan(imgs[0])
+        edge = np.sqrt(np.percentile(squared[bad], 1) if bad.any() else squared.max())
+    bounds = [tuple(b) for b in define_annuli_bounds(annuli, inner, edge, spacing)]
+    if outer is None:
+        bounds[-1] = (bounds[-1][0], imgs.shape[1])
+    return Annuli(bounds[0][0], bounds[-1][1], min(b - a for a, b in bounds))
+
+
+def fill(residual: NDArray[np.float64], good: NDArray[np.bool_]) -> int:
+    """Replace flagged pixels by the median of their good neighbours, in place.
+
+    Otherwise the spline that shifts and rotates frames would spread each bad pixel over a dozen
+    others. NaN pixels stay NaN; a flagged pixel without a good one within two pixels becomes NaN.
+
+    Parameters
+    ----------
+    residual : ndarray, (ny, nx)
+        Frame minus star.
+    good : ndarray of bool, (ny, nx)
+        False for flagged pixels.
+
+    Returns
+    -------
+    int
+        Number of pixels replaced.
+    """
+    trusted = np.where(good, residual, np.nan)
+    flagged = np.argwhere(~good & np.isfinite(residual))
+    for y, x in flagged:
+        for reach in (1, 2):
+            near = trusted[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+            near = near[np.isfinite(near)]
+            if near.size:
+                break
+        residual[y, x] = np.median(near) if near.size else np.nan
+    return len(flagged)
+
+
+def place(
+    residual: NDArray[np.float64],
+    old_center: NDArray[np.float64],
+    new_center: NDArray[np.float64],
+    annuli: Annuli,
+) -> NDArray[np.float64]:
+    """Shift a subtracted frame to the common centre, mask it, and subtract its pedestal.
+
+    The pedestal is the sigma-clipped median, which companions do not change. KLIP makes the mean
+    of each section zero, and code that reads its products relies on that.
+    """
+    from pyklip.klip import align_and_scale
+
+    placed = np.asarray(align_and_scale(residual, new_center=new_center, old_center=old_center))
+    y, x = np.indices(placed.shape)
+    r = np.hypot(x - new_center[0], y - new_center[1])
+    placed[(r < annuli.inner) | (r >= annuli.outer)] = np.nan
+    kept = np.isfinite(placed)
+    if kept.any():
+        placed -= sigma_clipped_stats(placed[kept])[1]
+    return placed
+
+
+def _number_type(dtype: Any) -> np.dtype[Any]:
+    """Number type of pyKLIP: single precision unless the call says otherwise."""
+    return np.dtype(ctypes.c_float if dtype is None else dtype)
+
+
+def slices(frames: NDArray[np.float64], count: int, dtype: Any) -> NDArray[Any]:
+    """Repeat frames (n, ny, nx) in pyKLIP's number type: (count, n, ny, nx).
+
+    Without a KL cut-off there is one result, but pyKLIP's later steps expect one slice for each
+    entry of numbasis.
+    """
+    return np.repeat(frames.astype(_number_type(dtype))[np.newaxis], count, axis=0)
+
+
+def noise_cube(
+    frames: NDArray[np.float64],
+    center: NDArray[np.float64],
+    annuli: Annuli,
+    count: int,
+    numthreads: int | None,
+) -> NDArray[np.float64]:
+    """Azimuthal scatter of frames (n, ny, nx) as measured by pyKLIP, (count, n, ny, nx)."""
+    from pyklip.parallelized import generate_noise_maps
+
+    maps = generate_noise_maps(
+        frames, center, annuli.width, IWA=annuli.inner, OWA=annuli.outer, numthreads=numthreads
+    )
+    return np.repeat(np.asarray(maps)[np.newaxis], count, axis=0)
+
+
+def aligned_before(
+    imgs: NDArray[Any],
+    centers: NDArray[Any],
+    wavelengths: NDArray[Any],
+    center: NDArray[np.float64],
+    dtype: Any,
+) -> NDArray[Any]:
+    """Unsubtracted frames for save_aligned: centred, and scaled to each of the wavelengths.
+
+    Returns
+    -------
+    ndarray, (wavelengths, n, ny, nx)
+    """
+    from pyklip.klip import align_and_scale
+
+    return np.array(
+        [
+            [
+                align_and_scale(img, new_center=center, old_center=old, scale_factor=to / at)
+                for img, old, at in zip(imgs, centers, wavelengths, strict=True)
+            ]
+            for to in np.unique(wavelengths)
+        ],
+        dtype=_number_type(dtype),
+    )
+
+
+# Checks that take a second, before minutes of fitting.
+
+
+def check_dataset(dataset: Any) -> None:
+    """Raise for a dataset without frames or without pixels."""
+    if np.ndim(dataset.input) != 3:
+        raise ShapeError(f"dataset.input: got shape {np.shape(dataset.input)}, expected 3-D")
+    require_frames(dataset)
+    if not np.isfinite(dataset.input).any():
+        raise NoValidPixelsError(
+            f"{list(map(str, dataset.filenames))}: every pixel of every frame is NaN, nothing "
+            "is left to fit"
+        )
+
+
+def check_arguments(arguments: Mapping[str, Any]) -> None:
+    """Raise for arguments of `klip_dataset` that do not go together."""
+    dataset, mode = arguments["dataset"], str(arguments["mode"])
+    if not any(part in mode.upper() for part in ("ADI", "RDI", "SDI")):
+        raise IncompatibleSetupError(
+            f"mode: got {mode!r}, expected ADI, RDI, SDI or a sum of them such as 'ADI+RDI'"
+        )
+    if mode.strip().upper() == "SDI" and len(np.unique(dataset.wvs)) == 1:
+        raise IncompatibleSetupError(
+            "mode: 'SDI' compares wavelengths, and this dataset has one. Use mode='ADI', or "
+            "mode='RDI' with a psf_library: the star is rendered, so neither needs references"
+        )
+    wavelengths = np.unique(dataset.wvs)
+    cubes, left_over = divmod(len(dataset.wvs), len(wavelengths))
+    if left_over or not np.array_equal(dataset.wvs, np.tile(wavelengths, cubes)):
+        raise IncompatibleSetupError(
+            f"dataset.wvs: pyKLIP takes frames of {len(wavelengths)} wavelengths for slices of "
+            "spectral cubes, one after the other from the shortest to the longest wavelength. "
+            "These have another order. Make one dataset for each filter, and reduce them one by one"
+        )
+    if arguments["calibrate_flux"]:
+        from pyklip.instruments.Instrument import Data
+
+        if type(dataset).calibrate_output is Data.calibrate_output:
+            raise IncompatibleSetupError(
+                f"calibrate_flux: a {type(dataset).__name__} has no flux calibration of its own. "
+                "Pass calibrate_flux=False; the products have the unit of the frames"
+            )
+
+
+def check_settings(settings: DiffrenderSettings) -> None:
+    """Raise for settings of the default subtractor that it could not use."""
+    if settings.threads is not None and settings.threads < 1:
+        raise IncompatibleSetupError(f"threads: got {settings.threads}, expected 1 or more")
+    if settings.image not in (None, *IMAGES):
+        raise IncompatibleSetupError(
+            f"image: got {settings.image!r}, expected one of {', '.join(IMAGES)}"
+        )
+    if settings.subtractor is not None:
+        return
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.pattern.choice import as_request
+
+    known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
+    wrong = sorted(set(settings.model_options) - known)
+    if wrong:
+        raise IncompatibleSetupError(
+            f"model_options: {', '.join(wrong)}: not known to nircam_coronagraph, which has "
+            f"{', '.join(sorted(known))}"
+        )
+    if settings.systematics is not None:
+        as_request(settings.systematics)
+    if settings.max_chi2 is not None and not settings.max_chi2 > 0:
+        raise IncompatibleSetupError(
+            f"max_chi2: got {settings.max_chi2}, expected a positive number; inf for no limit"
+        )
+
+
+# Copies of reduced frames to which faint sources were added: self-subtraction without a fit.
+#
+# A contrast curve by injection reduces the same frames a hundred times, with other planets in each.
+# Light that is added to the data changes the star by the image of H^-1 G (light), to first order
+# (see `linear.model`), so that the fit to the frames without it is all that is needed. The result
+# depends on nothing else, and not on the order of the copies.
+
+_SAME_PLACE = 0.01
+"""Pixels between the stars in frames and in their copies; centres are single precision."""
+
+
+def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
+    """The star in copies of reduced frames, which differ by faint sources.
+
+    Parameters
+    ----------
+    record : ReductionRecord
+        Of the frames without the sources.
+    frames : Frames
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If these are other frames, or their fit has no linear model.
+    """
+    _require_copy(record, frames)
+    before = record.subtraction
+    added = frames.data - record.frames.data
+    star = before.star.copy()
+    for result in dict.fromkeys(part.result for part in before.pointings):
+        parts = [part for part in before.pointings if part.result is result]
+        light = {}
+        for part in parts:
+            light[part.index] = torch.from_numpy(part.mean_light(added))[None]
+        change = result.linear.response(light)[:, 0]
+        for part in parts:
+            star[part.pointing.frames] += part.change_in_frames(change)
+    return dataclasses.replace(before, star=star)
+
+
+def _require_copy(record: ReductionRecord, frames: Frames) -> None:
+    """Raise for frames that are not copies of the reduced ones with a little light added."""
+    fits = record.subtraction.fits
+    if any(getattr(fit.result, "linear", None) is None for fit in fits):
+        raise IncompatibleSetupError(
+            "injected_into: its fits have no linear model; reduce it with a GaussNewton fit"
+        )
+    now, then = frames.observation, record.frames.observation
+    same = now.data.shape == then.data.shape and frames.pixels == record.frames.pixels
+    if same:
+        difference = np.abs(frames.data - record.frames.data) / then.error
+        # Sources change few pixels by more than the noise.
+        same = bool(
+            np.abs(now.center - then.center).max() < _SAME_PLACE
+            and np.median(difference[now.valid & then.valid]) < 1
+        )
+    if not same:
+        raise IncompatibleSetupError(
+            f"{now.name}: not a copy of the frames of injected_into to which faint sources were "
+            "added. Give the dataset that was reduced before the sources were added, read from the "
+            "same files"
+        )
+
+
+# One call of `klip_dataset` in which the star is rendered instead of estimated from references.
+
+_log = logging.getLogger(__name__)
 
 RESULTS = "diffrender_results"
 """Attribute of the dataset with one `ReductionRecord` per wavelength after a reduction."""
@@ -138,7 +461,7 @@ class DatasetReduction:
             raise
         self.dataset.filenames = names
         setattr(self.dataset, RESULTS, tuple(self.records))
-        logger.info("products of %r are in %s", self.arguments["fileprefix"], folder)
+        _log.info("products of %r are in %s", self.arguments["fileprefix"], folder)
 
     def _check(self) -> None:
         """Raise for input that cannot work, before anything is changed."""
@@ -192,7 +515,7 @@ class DatasetReduction:
 
     def _tell(self, line: str) -> None:
         """Say what is being done, as pyKLIP does."""
-        logger.info(line)
+        _log.info(line)
         # Its verbose=True prints, and whoever asks for it has no handler for our log.
         if self._verbose:
             print(f"diffrender: {line}", flush=True)

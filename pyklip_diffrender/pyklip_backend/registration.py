@@ -3,16 +3,308 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from typing import Any
+import logging
+import os
+import threading
+import warnings
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, Protocol
 
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings, OPDLike
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.pyklip_backend.backend_settings import (
+    DiffrenderSettings,
+    OPDLike,
+    settings_of,
+)
 from pyklip_diffrender.pyklip_backend.child import announce, spawned_beside_klip
-from pyklip_diffrender.pyklip_backend.dispatch import Patches
-from pyklip_diffrender.pyklip_backend.registry import ALGORITHM, BLOCK, REGISTRY
+from pyklip_diffrender.pyklip_backend.dataset_frames import keeping_references, keeping_source
+from pyklip_diffrender.pyklip_backend.forward_model import ForwardReduction
+from pyklip_diffrender.pyklip_backend.klip_call import RESULTS, DatasetReduction, mark_filtered
+from pyklip_diffrender.pyklip_backend.output_files import ReductionRecord
+from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 
-__all__ = ["ALGORITHM", "backend", "is_registered", "register", "unregister"]
+__all__ = [
+    "ALGORITHM",
+    "BLOCK",
+    "BOTH",
+    "REGISTRY",
+    "Patched",
+    "Patches",
+    "backend",
+    "dispatch",
+    "dispatch_fm",
+    "is_ours",
+    "is_registered",
+    "name_of",
+    "reduce_jwst_files",
+    "register",
+    "settings_for",
+    "unregister",
+    "warn_of_klip",
+]
+
+
+# Who uses the backend in this process, with which settings, and which calls are for it.
+
+ALGORITHM = "diffrender"
+"""Value of the argument `algo` of `klip_dataset`."""
+
+BOTH = f"{ALGORITHM}+klip"
+"""Name of the algorithm that writes KLIP's products beside those of this backend."""
+
+
+class Patched(Protocol):
+    """The functions of pyKLIP that are changed while the backend is in use."""
+
+    klip_dataset: PatchedFunction
+    fm_klip_dataset: PatchedFunction
+
+    def restore(self) -> None:
+        """Undo the changes."""
+
+
+class Registry:
+    """The users of the backend, and the settings given to `register`.
+
+    Attributes
+    ----------
+    lock : RLock
+        For changes of the others.
+    patches : Patched or None
+        None while nobody uses the backend.
+    registered : bool
+    blocks, forcing : int
+        Number of `backend` blocks in all threads, and of those that take over KLIP.
+    watching : bool
+        Whether plain KLIP is mentioned, in a spawned process.
+    defaults : DiffrenderSettings
+    replace : bool or None
+        Whether `register` was told to take over KLIP.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.patches: Patched | None = None
+        self.registered = False
+        self.blocks = 0
+        self.forcing = 0
+        self.watching = False
+        self.defaults = DiffrenderSettings()
+        self.replace: bool | None = None
+
+
+REGISTRY = Registry()
+
+_NO_BLOCK = (DiffrenderSettings(), None)
+BLOCK: ContextVar[tuple[DiffrenderSettings, bool | None]] = ContextVar(
+    "diffrender", default=_NO_BLOCK
+)
+"""Settings of the enclosing `backend` blocks, and whether they take over KLIP; None without."""
+
+_warned: weakref.WeakSet[ReductionRecord] = weakref.WeakSet()
+"""Reductions whose dataset, or a copy of it, was given to KLIP with a warning."""
+
+
+def _takes_klip() -> bool | None:
+    """Whether calls with ``algo="klip"`` are for this backend; None if nobody has said so."""
+    _, force = BLOCK.get()
+    return REGISTRY.replace if force is None else force
+
+
+def name_of(algo: Any) -> str:
+    """The argument `algo` in lower case and without spaces."""
+    return "".join(str(algo).lower().split())
+
+
+def is_ours(algo: Any) -> bool:
+    """Whether a call with this `algo` is for this backend."""
+    name = name_of(algo)
+    return name in (ALGORITHM, BOTH) or (name == "klip" and bool(_takes_klip()))
+
+
+def _outside_block() -> bool:
+    """Whether a `backend` block was entered, but in other threads only."""
+    return REGISTRY.blocks > 0 and BLOCK.get() is _NO_BLOCK
+
+
+def warn_of_klip(dataset: Any, function: str) -> None:
+    """Warn if KLIP runs where this backend may be expected."""
+    if _takes_klip() is None and (REGISTRY.watching or (REGISTRY.forcing and _outside_block())):
+        place = "spawned process" if REGISTRY.watching else "thread"
+        warnings.warn(
+            f"{function} runs KLIP in this {place}, to which the `with backend():` block or "
+            "register(replace=True) that another one has entered does not extend. Call "
+            f"register(replace=True, ...) or enter a block in the {place} itself",
+            DiffrenderWarning,
+            stacklevel=4,
+        )
+        return
+    records = getattr(dataset, RESULTS, ())
+    if not records or records[0] in _warned or _takes_klip() is not None:
+        return
+    _warned.add(records[0])
+    warnings.warn(
+        f"{function} runs KLIP on a dataset that was reduced with algo='diffrender' before. "
+        "register(replace=True) or `with backend():` redirects calls of klip_dataset that ask for "
+        "algo='klip'; register(replace=False) runs KLIP without this warning",
+        DiffrenderWarning,
+        stacklevel=4,
+    )
+
+
+def settings_for(dataset: Any) -> DiffrenderSettings:
+    """Return the settings of the enclosing blocks, of the dataset and of `register`, merged."""
+    settings, _ = BLOCK.get()
+    if _outside_block():
+        warnings.warn(
+            "settings of a `with backend():` block that another thread has entered do not hold in "
+            "this thread. Enter a block in the thread itself, or give the settings to register()",
+            DiffrenderWarning,
+            stacklevel=4,
+        )
+    return settings.over(settings_of(dataset)).over(REGISTRY.defaults)
+
+
+# Calls of pyKLIP's `klip_dataset`, handled by this backend or by pyKLIP's own code.
+#
+# Scripts often hold `klip_dataset` itself (``from pyklip.parallelized import klip_dataset``) long
+# before this package is imported, so replacing the name in its module would not reach them. Instead
+# the function object stays and its code is replaced by a call of `dispatch`, which runs pyKLIP's
+# own code for every other algorithm.
+
+_log = logging.getLogger(__name__)
+
+
+class Patches:
+    """The changes to pyKLIP while the backend is in use."""
+
+    def __init__(self) -> None:
+        from pyklip import fm, parallelized
+
+        self.klip_dataset = PatchedFunction(
+            parallelized.klip_dataset,
+            _klip_dataset,
+            ("klip_parallelized", "klip_parallelized_lite", "high_pass_filter_imgs"),
+        )
+        self.fm_klip_dataset = PatchedFunction(
+            fm.klip_dataset, _fm_klip_dataset, ("klip_parallelized", "high_pass_filter_imgs")
+        )
+        self._all: list[PatchedFunction | PatchedMethod] = [self.klip_dataset, self.fm_klip_dataset]
+        try:
+            from pyklip.instruments.JWST import JWSTData
+        except ImportError as error:
+            # It needs astroquery, which other instruments do not.
+            _log.info("pyKLIP's JWST reader cannot be imported, so is not extended: %s", error)
+        else:
+            self._all.append(PatchedMethod(JWSTData, "readdata", keeping_source))
+            self._all.append(PatchedMethod(JWSTData, "readpsflib", keeping_references))
+
+    def apply(self) -> None:
+        """Change pyKLIP."""
+        for patch in self._all:
+            patch.apply()
+
+    def restore(self) -> None:
+        """Undo the changes exactly."""
+        for patch in reversed(self._all):
+            patch.restore()
+
+
+def _patches() -> Patched:
+    """The patches that led to the present call; another thread may just have removed them."""
+    patches = REGISTRY.patches
+    if patches is None:
+        raise IncompatibleSetupError("diffrender was unregistered while klip_dataset was called")
+    return patches
+
+
+def dispatch(*args: Any, **kwargs: Any) -> None:
+    """Handle a call of `pyklip.parallelized.klip_dataset`: with this backend or pyKLIP's code."""
+    klip_dataset = _patches().klip_dataset
+    try:
+        call = klip_dataset.signature.bind(*args, **kwargs)
+    except TypeError:
+        # Prefer the message of pyKLIP's own code.
+        klip_dataset.original()(*args, **kwargs)
+        raise
+    call.apply_defaults()
+    arguments = call.arguments
+    if is_ours(arguments["algo"]):
+        settings = settings_for(arguments["dataset"])
+        before = dict(vars(arguments["dataset"]))
+        DatasetReduction(arguments, settings).run(klip_dataset.original)
+        if name_of(arguments["algo"]) == BOTH:
+            _run_klip(klip_dataset.original(), arguments, before)
+    else:
+        if str(arguments["algo"]).lower() == "klip":
+            warn_of_klip(arguments["dataset"], "klip_dataset")
+        klip_dataset.original()(*args, **kwargs)
+    if arguments["highpass"] not in (False, None):
+        mark_filtered(arguments["dataset"])
+
+
+def _run_klip(
+    klip_dataset: Callable[..., None], arguments: Mapping[str, Any], before: Mapping[str, Any]
+) -> None:
+    """Write KLIP's products beside those of this backend, whose results stay in the dataset.
+
+    Parameters
+    ----------
+    klip_dataset : callable
+        pyKLIP's function.
+    arguments : mapping
+        Of the call.
+    before : mapping
+        Attributes of the dataset before the call, from which KLIP starts.
+    """
+    attributes = vars(arguments["dataset"])
+    after = dict(attributes)
+    attributes.clear()
+    attributes.update(before)
+    try:
+        prefix = f"{arguments['fileprefix']}-klip"
+        klip_dataset(**{**arguments, "algo": "klip", "fileprefix": prefix})
+    finally:
+        attributes.clear()
+        attributes.update(after)
+
+
+def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
+    """Handle a call of `pyklip.fm.klip_dataset`, to which this package adds an argument `algo`."""
+    klip_dataset = _patches().fm_klip_dataset
+    if name_of(kwargs.get("algo")) == BOTH:
+        raise IncompatibleSetupError(
+            f"algo: pyklip.fm.klip_dataset takes 'diffrender' or 'klip', not {BOTH!r}, because an "
+            "fm_class is for one of them. Call it twice"
+        )
+    if not is_ours(kwargs.get("algo", "klip")):
+        warn_of_klip(args[0] if args else kwargs.get("dataset"), "pyklip.fm.klip_dataset")
+        return klip_dataset.original()(*args, **kwargs)
+    kwargs.pop("algo", None)
+    call = klip_dataset.signature.bind(*args, **kwargs)
+    call.apply_defaults()
+    dataset = call.arguments["dataset"]
+    ForwardReduction(call.arguments, settings_for(dataset)).run(klip_dataset.original)
+    if call.arguments["highpass"] not in (False, None):
+        mark_filtered(dataset)
+    return None
+
+
+def _klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
+    # Runs in place of pyKLIP's code, with its globals: names of this module are not available.
+
+    return dispatch(*args, **kwargs)
+
+
+def _fm_klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
+
+    return dispatch_fm(*args, **kwargs)
+
+
+# Make ``algo="diffrender"`` work in pyKLIP, permanently or in a block, and undo it exactly.
 
 
 def _use(registered: bool, blocks: int, forcing: int | None = None) -> None:
@@ -159,3 +451,71 @@ if spawned_beside_klip():
     with REGISTRY.lock:
         REGISTRY.watching = True
         _use(REGISTRY.registered, REGISTRY.blocks)
+
+
+# A reduction of JWST files by `klip_dataset` in one call.
+
+
+def reduce_jwst_files(
+    science: Iterable[str | os.PathLike[str]],
+    references: Iterable[str | os.PathLike[str]] = (),
+    *,
+    folder: str | os.PathLike[str],
+    prefix: str,
+    verbose: bool = False,
+    **settings: Any,
+) -> Any:
+    """Subtract the star from all rolls together and write pyKLIP's products.
+
+    Parameters
+    ----------
+    science, references : iterable of path
+        Files of the target and of reference stars, with the star at STARCENX, STARCENY.
+    folder : path
+        Of the products.
+    prefix : str
+        First part of their names.
+    verbose : bool
+        Print what is being done.
+    **settings
+        Fields of `DiffrenderSettings`.
+
+    Returns
+    -------
+    JWSTData
+        The reduced dataset, with its fits in ``diffrender_results``.
+
+    Raises
+    ------
+    DiffrenderError
+        See `klip_dataset` in the guide to pyKLIP scripts.
+    """
+    from pyklip.instruments.JWST import JWSTData
+    from pyklip.parallelized import klip_dataset
+
+    others = [str(Path(path)) for path in references]
+    with backend(force=False, **settings):
+        dataset = JWSTData(
+            [str(Path(path)) for path in science],
+            others or None,
+            highpass=False,
+            center_include_offset=False,
+            center_keywords=["STARCENX", "STARCENY"],
+        )
+        klip_dataset(
+            dataset,
+            mode="ADI+RDI" if others else "ADI",
+            outputdir=str(folder),
+            fileprefix=prefix,
+            annuli=1,
+            subsections=1,
+            numbasis=[1],
+            movement=1,
+            psf_library=dataset.psflib,
+            # The middle of the array, where spaceKLIP has the star; pyKLIP's own choice is half a
+            # pixel off for an even side.
+            aligned_center=list(dataset.centers[0]),
+            algo=ALGORITHM,
+            verbose=verbose,
+        )
+    return dataset

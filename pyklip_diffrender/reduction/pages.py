@@ -1,23 +1,273 @@
-"""Pages of HTML that need no other file: their templates, pictures and numbers."""
+"""Pages of HTML that need no other file: templates, pictures, numbers and results in words."""
 
 from __future__ import annotations
 
+import math
 import re
 from base64 import b64encode
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+import numpy as np
+
 from pyklip_diffrender import drawing
-from pyklip_diffrender.reduction.words import number, plus_minus, probability, scientific
+from pyklip_diffrender.refinement import Status
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["FIGURE_FORMATS", "Picture", "count", "render", "write_figures"]
+__all__ = [
+    "FIGURE_FORMATS",
+    "Picture",
+    "advice",
+    "count",
+    "depth_against_klip",
+    "number",
+    "plus_minus",
+    "position_angle",
+    "probability",
+    "render",
+    "scientific",
+    "sentence",
+    "write_figures",
+]
+
+
+# Numbers and results in words.
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+_SENTENCE_AT = 1.5
+"""Separation, arcsec, near which the first sentence states the limit."""
+
+_TINY = 1e-9
+"""Probabilities below this rest on tails that no noise is known to follow."""
+
+_ADVICE = {
+    Status.CONVERGED: "The stated errors and limits can be used as they are.",
+    Status.MODEL_MISMATCH: (
+        "Fits of real frames often end with this status, mostly because the flat-field pattern is "
+        "not known or light is extended. The errors have been scaled to the scatter in the S/N "
+        "map, but faint candidates deserve a second look: see whether they are in every roll and "
+        "whether they look like a point source. Check the filter, the masks and the date of the "
+        "wavefront map."
+    ),
+    Status.PRIOR_MISMATCH: (
+        "The errors have been scaled to the scatter in the S/N map. Repeat the fit with "
+        "fit_scales=True, with wider scales, or with a wavefront map nearer in time."
+    ),
+    Status.ITERATION_LIMIT: (
+        "Look at the history of the fit. If chi-squared was still falling, repeat the fit with a "
+        "larger max_iterations; if it hardly changed, try a wavefront map nearer in time."
+    ),
+    Status.DIVERGED: (
+        "Do not use this result. Check the unit and orientation of the wavefront map, the position "
+        "of the star and the pixel mask."
+    ),
+}
+
+_REFERENCES = (
+    " The flat-field pattern was not known: add reference stars, or the systematics.fits of an "
+    "earlier reduction."
+)
+
+
+def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
+    """Advice about the status of a fit.
+
+    Parameters
+    ----------
+    status : Status
+    patterned : bool
+        Whether the flat-field pattern was known.
+    remark : str
+        Further advice about the reduction.
+    """
+    missing = _REFERENCES if status is Status.MODEL_MISMATCH and not patterned else ""
+    return f"{_ADVICE[status]}{missing} {remark}".rstrip()
+
+
+def sentence(summary: Mapping[str, Any]) -> str:
+    """The result in a few sentences."""
+    parts = [_compact(summary)]
+    if summary["extended"]:
+        parts.insert(0, f"{summary['extended']}: fit extended light first, with --disk.")
+    if summary["disk"] is not None:
+        parts.insert(0, _extended(summary))
+    if summary["wide_field"] is not None:
+        parts.append(_outside(summary))
+    if summary["accuracy"] == "quick":
+        parts.append(
+            "This is a first look with a coarser model, whose limits are not those of a full "
+            "reduction."
+        )
+    return " ".join(parts)
+
+
+def _outside(summary: Mapping[str, Any]) -> str:
+    """How many sources there are beyond the fitted pixels."""
+    shapes = [each["shape"] for each in summary["wide_field"]["candidates"]]
+    kinds = {
+        "more candidate": shapes.count("point"),
+        "extended or blended source": shapes.count("extended"),
+    }
+    counts = [f"{n} {kind}{'' if n == 1 else 's'}" for kind, n in kinds.items() if n]
+    if not counts:
+        return "Nothing was found farther from the star, in the whole frames."
+    verb = "is" if next(filter(None, kinds.values())) == 1 else "are"
+    return f"Farther from the star, in the whole frames, there {verb} {' and '.join(counts)}."
+
+
+def _extended(summary: Mapping[str, Any]) -> str:
+    """The extended light in a sentence."""
+    disk = summary["disk"]
+    angle = disk["position_angle_deg"]
+    along = "" if angle is None else f", its long axis at a position angle of {angle:.1f} deg"
+    return f"Extended light of {scientific(disk['contrast'])} of the star's was fitted{along}."
+
+
+def _compact(summary: Mapping[str, Any]) -> str:
+    """Companions, or the limit, in a sentence or two."""
+    candidates, threshold = summary["candidates"], summary["threshold_snr"]
+    if not candidates:
+        return " ".join([f"No companion above {threshold:g} sigma.", *_limit(summary)])
+    first = candidates[0]
+    measured = (
+        f"{plus_minus(first['separation_arcsec'], first['separation_error_arcsec'])} arcsec, "
+        f"position angle {position_angle(first, oriented=summary['oriented'])}, contrast "
+        f"{scientific(first['contrast'], first['contrast_error'])}, S/N {first['snr']:.1f}."
+    )
+    if len(candidates) == 1:
+        return f"One companion candidate at {measured}"
+    return (
+        f"{len(candidates)} companion candidates above {threshold:g} sigma, the most significant "
+        f"at {measured}"
+    )
+
+
+def _limit(summary: Mapping[str, Any]) -> Sequence[str]:
+    """The faintest planet that would have been seen, if that is known anywhere."""
+    if not summary["limits"]:
+        return []
+    row = min(summary["limits"], key=lambda each: abs(each["separation_arcsec"] - _SENTENCE_AT))
+    threshold = summary["threshold_snr"]
+    contrast = row["contrast"] * threshold / summary["contrast_curve"]["sigmas"]
+    return [
+        f"A planet of contrast {scientific(contrast)} ({-2.5 * math.log10(contrast):.1f} mag "
+        f"fainter than the star) at {row['separation_arcsec']:.3g} arcsec would have had an S/N of "
+        f"{threshold:g}."
+    ]
+
+
+def position_angle(candidate: Mapping[str, Any], *, oriented: bool) -> str:
+    """Position angle of a candidate, and what it is counted from."""
+    angle = plus_minus(candidate["position_angle_deg"], candidate["position_angle_error_deg"])
+    origin = "east of north" if oriented else "counter-clockwise from up in the frame"
+    return f"{angle} deg {origin}"
+
+
+def plus_minus(value: float, error: float) -> str:
+    """Value and error, to the digits that the error allows."""
+    places = _places(error)
+    return f"{value:.{places}f} ± {error:.{places}f}"
+
+
+def scientific(value: float, error: float | None = None) -> str:
+    """A number times a power of ten, such as 4.5 × 10⁻⁶, perhaps with its error."""
+    if value == 0:
+        return "0"
+    digits, exponent = f"{value:.1e}".split("e")
+    power = int(exponent)
+    ten = f"10{str(power).translate(_SUPERSCRIPTS)}"
+    if error is None:
+        return f"{digits} × {ten}"
+    return f"({plus_minus(value / 10**power, error / 10**power)}) × {ten}"
+
+
+def probability(value: float | None) -> str:
+    """A probability of a false alarm; "not stated" for None."""
+    if value is None:
+        return "not stated"
+    if value < _TINY:
+        return f"< {scientific(_TINY).replace('1.0 × ', '')}"
+    return scientific(value) if value < 0.01 else f"{value:.2f}"
+
+
+def number(value: Any, form: str = ".3g", unit: str = "") -> str:
+    """A number with its unit; "not known" for None."""
+    return "not known" if value is None else f"{value:{form}}{unit and f' {unit}'}"
+
+
+def _places(error: float) -> int:
+    """Decimals that show an error with one digit, or two if the first is a 1."""
+    if not error > 0 or not math.isfinite(error):
+        return 3
+    power = math.floor(math.log10(error))
+    return max(0, -power + (error / 10**power < 2))
+
+
+def depth_against_klip(curve: Mapping[str, Any], klip: Mapping[str, Any] | None) -> str:
+    """Say in a sentence whose limits are deeper at which separations, and by how much.
+
+    Parameters
+    ----------
+    curve, klip : dict
+        Contrast curves of a summary, with lists separation_arcsec, contrast and small_sample.
+        Those of KLIP are compared at its separations, as far as both have limits.
+
+    Returns
+    -------
+    str
+        Empty without KLIP, or if the curves have no separation in common.
+    """
+    if klip is None:
+        return ""
+    raw, corrected = (_deeper(curve, klip, name) for name in ("contrast", "small_sample"))
+    if not raw and not corrected:
+        return ""
+    return (
+        f"Without a small-sample correction of either, {raw or 'no limits can be compared'}; with "
+        f"it, {corrected or 'no limits can be compared'}."
+    )
+
+
+def _deeper(curve: Mapping[str, Any], klip: Mapping[str, Any], name: str) -> str:
+    """Where this package and where KLIP has the deeper limits of one kind."""
+    places, ours, at, theirs = (
+        np.array(values, dtype=float)
+        for values in (
+            curve["separation_arcsec"], curve[name], klip["separation_arcsec"], klip[name],
+        )
+    )  # fmt: skip
+    if not len(places):
+        return ""
+    ratios = theirs / np.exp(np.interp(at, places, np.log(ours), np.nan, np.nan))
+    known = [(s, r) for s, r in zip(at, ratios, strict=True) if math.isfinite(r)]
+    parts = []
+    for is_ours, run in groupby(known, lambda each: each[1] >= 1):
+        separations, factors = np.array(list(run)).T
+        if not is_ours:
+            factors = 1 / factors
+        span = _span(separations, ".2f")
+        parts.append(
+            f"{'this reduction' if is_ours else 'KLIP'} is {_span(factors, '.1f')} times deeper at "
+            f"{span} arcsec"
+        )
+    return " and ".join(parts)
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    """The range of values, or one number if its ends are written alike."""
+    ends = [f"{each:{form}}" for each in (min(values), max(values))]
+    return " to ".join(dict.fromkeys(ends))
+
+
+# Pages of HTML that need no other file: their templates, pictures and numbers.
 
 FIGURE_FORMATS = ("pdf", "png", "svg")
 """Formats in which the figures of a page can be written as files of their own."""

@@ -1,24 +1,288 @@
-"""The pictures of the report, with descriptions."""
+"""Images of the sky with north up, the result at a glance, and the pictures of the report."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans
+from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve
-from pyklip_diffrender.reduction.overview import Overview
-from pyklip_diffrender.reduction.pages import Picture
+from pyklip_diffrender.detection import (
+    Detection,
+    Disk,
+    WideField,
+    combine_frames,
+    draw_curve,
+    image_hdu,
+)
+from pyklip_diffrender.imaging import SkyModel
+from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.headers import fits_unit
+from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.reduction.pages import Picture, number, plus_minus, scientific
 from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.summary import wavefronts
-from pyklip_diffrender.reduction.words import number, plus_minus, scientific
+from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
-__all__ = ["MOST_FRAMES", "ReportPictures"]
+__all__ = ["MOST_FRAMES", "Klip", "Overview", "ReportPictures", "SkyImages"]
+
+
+# Images of the sky about the star with north up, of all frames together.
+
+Image = NDArray[np.float64]
+
+
+class SkyImages:
+    """Images with north up, or with the orientation of the first frame where north is not known.
+
+    Parameters
+    ----------
+    reduction : Reduction
+
+    Attributes
+    ----------
+    grid : ndarray, (n, n, 2)
+        x, y of the pixels from the star, arcsec; y is north and x is west.
+    """
+
+    def __init__(self, reduction: Reduction) -> None:
+        self.detection: Detection = reduction.detection
+        self._disk = reduction.disk
+        self._templates = self.detection.groups[0][1]
+        observation = self.detection.observation
+        self.oriented = observation.position_angles is not None
+        self._half = max(observation.shape) // 2
+        y, x = np.mgrid[-self._half : self._half + 1, -self._half : self._half + 1]
+        self.grid = np.sqrt(np.prod(observation.pixelscale)) * np.stack([x, y], axis=-1)
+        self.to_sky = rotation_matrix(self.detection.north)
+
+    @cached_property
+    def combined(self) -> tuple[Image, Image]:
+        """Mean of the frames minus the star, and its standard deviation, in the frames' unit."""
+        images, errors = {}, {}
+        lights: Sequence[Any] = [0.0] * len(self._templates.frames)
+        if self._disk is not None:
+            lights = self._disk.light
+        # Frames of reference stars may be among those that were fitted.
+        for (k, frame), light in zip(self._templates.frames.items(), lights, strict=True):
+            subtracted = self.detection.subtracted[k]
+            filled = interpolate_replace_nans(subtracted, Gaussian2DKernel(1.0))
+            images[k] = np.nan_to_num(filled) + light
+            error = frame.observation.combined().error[0]
+            errors[k] = np.where(np.isfinite(subtracted), error, np.inf)
+        return combine_frames(self._templates, images, errors, self.grid @ self.to_sky)
+
+    @cached_property
+    def posterior_mean(self) -> tuple[Image, Image]:
+        """Light of neither star nor detector, and its standard deviation, in the frames' unit.
+
+        See `imaging.sky_model`. Point sources have 0.4 to 1 of their peak, least close to the star,
+        and no side lobes.
+        """
+        model = SkyModel(self.detection.fits)
+        middle = slice(model.center - self._half, model.center + self._half + 1)
+        mean, error = (image[middle, middle] for image in (model.estimate()[0], model.error()))
+        return mean, error * self.detection.error_factor.of(self.grid @ self.to_sky)
+
+    @cached_property
+    def throughput(self) -> Image:
+        """Fraction of the light of a faint source that `combined` has, by a matched filter.
+
+        The fit of the star takes the rest. By linear theory it is the ratio of what the frames say
+        of the source's flux with the star marginalised, and with the star known; the light of a
+        candidate, which is fitted with the star, is in the image as a whole.
+        """
+        detection = self.detection
+        error = detection.error / detection.error_factor.of(detection.grid)
+        return self.turned((detection.photon_error / error) ** 2)
+
+    @property
+    def has_disk(self) -> bool:
+        """Whether extended light was fitted, which the combined image has and the others lack."""
+        return self._disk is not None
+
+    def turned(self, on_frame: Image) -> Image:
+        """Interpolate an image on the pixels of the first frame."""
+        offsets = torch.from_numpy((self.grid @ self.to_sky).reshape(-1, 2))
+        places = self._templates.pixels_of(min(self._templates.frames), offsets)
+        values = map_coordinates(on_frame, places, order=1, cval=np.nan)
+        return np.asarray(values.reshape(self.grid.shape[:2]))
+
+    def write(self, path: Path) -> Path:
+        """Write all images to a FITS file with a world coordinate system."""
+        detection = self.detection
+        unit = fits_unit(detection.observation.unit)
+        mean, error = self.combined
+        sky, sky_error = self.posterior_mean
+        images = {
+            "COMBINED": (mean, unit),
+            "COMBINED_ERROR": (error, unit),
+            "THROUGHPUT": (self.throughput, ""),
+            "POSTERIOR_MEAN": (sky, unit),
+            "POSTERIOR_MEAN_ERROR": (sky_error, unit),
+            "CONTRAST": (self.turned(detection.contrast), ""),
+            "CONTRAST_ERROR": (self.turned(detection.error), ""),
+            "SNR": (self.turned(detection.snr), ""),
+        }
+        wcs = world_coordinates(self.grid @ self.to_sky, detection.observation)
+        first = primary_hdu(detection.observation, detection.provenance, detection.sky.mjd)
+        hdus = [image_hdu(image, name, unit, wcs) for name, (image, unit) in images.items()]
+        with replacing(path) as temporary:
+            fits.HDUList([first, *hdus]).writeto(temporary, overwrite=True, checksum=True)
+        return path
+
+
+# The result at a glance: the frames without the star, KLIP's beside them, and the S/N map.
+
+_log = logging.getLogger(__name__)
+
+
+_LINEAR = 5.0
+"""Linear part of the scale for light, standard deviations of the noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Klip:
+    """KLIP on the frames of a reduction.
+
+    Attributes
+    ----------
+    curve : QTable
+        See `klip_curve`.
+    image : ndarray, (ny, nx)
+        Frames without the star, combined, north up.
+    grid : ndarray, (ny, nx, 2)
+        x, y of its pixels from the star, arcsec.
+    label : str
+        References and modes of the image.
+    """
+
+    curve: QTable
+    image: Image
+    grid: Image
+    label: str
+
+    @classmethod
+    def of(cls, reduction: Reduction) -> Klip | None:
+        """KLIP for a reduction; None where it has no references or fails."""
+        sequence, detection = reduction.sequence, reduction.detection
+        if not sequence.references and len(sequence.science) < 2:
+            return None
+        # A disk is part of the frames that KLIP would get.
+        science = None if reduction.disk is None else sequence.science
+        try:
+            # pyKLIP is loaded only if it is needed.
+            from pyklip_diffrender.reduction.klip import klip_curve, klip_image
+
+            curve = klip_curve(detection, sequence.references)
+            modes = int(np.median(curve["modes"]))
+            image = klip_image(
+                detection, sequence.references, science, modes=modes, north=detection.north
+            )
+        except Exception as error:  # An addition to the report, which is complete without it.
+            _log.warning("the report has no comparison with KLIP: %s", error)
+            return None
+        return cls(curve, *image)
+
+
+class Overview:
+    """Images with north up, or with the orientation of the first frame where north is not known.
+
+    Parameters
+    ----------
+    images : SkyImages
+    klip : Klip, optional
+    """
+
+    def __init__(self, images: SkyImages, klip: Klip | None) -> None:
+        self.images, self.klip = images, klip
+        detection = images.detection
+        self._detection = detection
+        self._unit = drawing.unit_label(detection.observation.unit)
+        table = detection.candidates
+        self._places = np.stack([table["x"].value, table["y"].value], axis=1) @ images.to_sky.T
+        self._labels = [f"S/N {each:.1f}" for each in table["snr"]]
+
+    @property
+    def panels(self) -> tuple[str, ...]:
+        """Names of the panels: the image, KLIP's, the most probable image, and the S/N."""
+        return (
+            "without_star",
+            *(() if self.klip is None else ("klip",)),
+            # With a disk in the model that image would lack its light.
+            *(() if self.images.has_disk else ("most_probable",)),
+            "snr",
+        )
+
+    def draw(self, ax: Any, panel: str) -> None:
+        """Draw one of `panels`; all images of light have the same scale.
+
+        Parameters
+        ----------
+        ax : Axes
+        panel : str
+        """
+        grid, north = self.images.grid, 0.0 if self.images.oriented else None
+        if panel == "snr":
+            snr = self.images.turned(self._detection.snr)
+            drawing.snr_map(ax, snr, grid, self._places, north, title="S/N", labels=self._labels)
+            return
+        mean, error = self.images.combined
+        image, title = mean, "Without the star"
+        if panel == "most_probable":
+            image, title = self.images.posterior_mean[0], "Most probable image"
+        if panel == "klip" and self.klip is not None:
+            image, grid, title = self.klip.image, self.klip.grid, self.klip.label
+        drawing.signed_image(
+            ax, image, grid, float(np.nanmax(np.abs(mean))), bar=self._unit, title=title,
+            places=self._places, linear=_LINEAR * float(np.nanmedian(error)), north=north,
+        )  # fmt: skip
+        pixel = self.images.grid[0, 1, 0] - self.images.grid[0, 0, 0]
+        half = np.abs(self.images.grid).max() + pixel / 2
+        ax.set_xlim(-half, half)
+        ax.set_ylim(-half, half)
+
+    def kept(self, separations: Sequence[float]) -> tuple[Image, Image | None]:
+        """Fractions of a faint source's light that the image and KLIP leave at separations.
+
+        Medians of rings a resolution element wide; KLIP's are those of its best numbers of modes.
+        """
+        resolution = self._detection.contrast_curve.meta["resolution_arcsec"]
+        distance = np.hypot(*np.moveaxis(self.images.grid, -1, 0))
+        kept = self.images.throughput
+        ours = [
+            np.nanmedian(kept[np.abs(distance - each) < resolution / 2]) for each in separations
+        ]
+        if self.klip is None:
+            return np.array(ours), None
+        curve = self.klip.curve
+        theirs = np.interp(
+            separations, curve["separation"].value, curve["throughput"], np.nan, np.nan
+        )
+        return np.array(ours), np.asarray(theirs)
+
+    def figure(self) -> Any:
+        """One figure of the panels but the most probable image, and the contrast curve."""
+        panels = [each for each in self.panels if each != "most_probable"]
+        figure, axes = drawing.new_figure(1, len(panels) + 1)
+        for ax, panel in zip(axes[0], panels, strict=False):
+            self.draw(ax, panel)
+        draw_curve(axes[0, -1], self._detection, self.klip and self.klip.curve)
+        return figure
+
+
+# The pictures of the report, with descriptions.
 
 Pictures = Sequence[Picture]
 

@@ -1,4 +1,4 @@
-"""The result of a reduction."""
+"""The result of a reduction, and whether its candidates are parts of extended light."""
 
 from __future__ import annotations
 
@@ -8,18 +8,103 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from astropy.table import QTable
+from numpy.typing import NDArray
+from scipy import stats
 
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.io.files import require_new
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.reduction.extended import looks_extended, on_extended_light
 from pyklip_diffrender.reduction.visit import Visit
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.systematics import Systematics
 
-__all__ = ["Reduction"]
+__all__ = ["Reduction", "looks_extended", "on_extended_light"]
+
+
+# Whether candidates are parts of extended light, such as a disk, rather than planets.
+
+_UNLIKELY = 0.01
+"""Probability below which unrelated sources are not taken to be arranged by chance."""
+
+_NEAR = 1.5
+"""Separation of neighbours, lambda/D: one extended source is found as several this close."""
+
+
+def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
+    """Say how candidates are arranged like extended light.
+
+    Sources that have nothing to do with each other have independent position angles, and are
+    spread evenly over the field. The number of candidates alone says nothing.
+
+    Parameters
+    ----------
+    candidates : QTable
+        Columns x and y from the star, and frame_angle.
+    resolution : float
+        lambda/D, arcsec.
+    edge : float
+        Largest separation that was searched, arcsec.
+
+    Returns
+    -------
+    str
+        Empty if the candidates may be where they are by chance.
+    """
+    count = len(candidates)
+    if count < 2:
+        return ""
+    if count > 2:
+        axes = np.sort(candidates["frame_angle"].value % 180)
+        gaps = np.diff(axes, append=axes[0] + 180)
+        # All axes are in the arc that is left by the largest gap. The probability that n random
+        # axes are in an arc a of their circle, a < 1/2, is n a^(n - 1).
+        arc = 1 - gaps.max() / 180
+        if arc < 0.5 and count * arc ** (count - 1) < _UNLIKELY:
+            return "The candidates are in line with the star, like an edge-on disk"
+    places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
+    distances = np.hypot(*(places[:, None] - places).T)[np.triu_indices(count, 1)]
+    reach = _NEAR * resolution
+    expected = len(distances) * (reach / edge) ** 2
+    if stats.poisson.sf((distances < reach).sum() - 1, expected) < _UNLIKELY:
+        return "Candidates are next to each other, like parts of an extended source"
+    return ""
+
+
+def on_extended_light(candidates: QTable, offsets: NDArray[np.float64], resolution: float) -> str:
+    """Say which candidates lie on extended light that was fitted.
+
+    Parameters
+    ----------
+    candidates : QTable
+        Columns x, y and separation.
+    offsets : ndarray, (k, 2)
+        x, y of the sources of the extended light from the star, arcsec.
+    resolution : float
+        lambda/D, arcsec.
+
+    Returns
+    -------
+    str
+        Empty if there is none.
+    """
+    if not len(candidates) or not len(offsets):
+        return ""
+    places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
+    away = np.hypot(*np.moveaxis(places[:, None] - offsets, -1, 0)).min(axis=1)
+    near = np.sort(candidates["separation"].value[away < resolution])
+    if not len(near):
+        return ""
+    separations = ", ".join(f"{each:.2f}" for each in near)
+    return (
+        f"On the extended light, candidates at {separations} arcsec may be parts of it that its "
+        "fit has left."
+    )
+
+
+# The result of a reduction.
 
 _LARGE = 4.0
 """Chi-squared per pixel above which more is missing than what real frames leave where the pattern

@@ -25,8 +25,7 @@ from scipy.sparse.csgraph import connected_components
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Combination
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.reduction.pages import Picture, render
-from pyklip_diffrender.reduction.words import plus_minus, scientific
+from pyklip_diffrender.reduction.pages import Picture, plus_minus, render, scientific
 
 __all__ = [
     "COMPARISON",

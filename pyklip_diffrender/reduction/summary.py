@@ -18,8 +18,8 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
+from pyklip_diffrender.reduction.pages import advice, sentence
 from pyklip_diffrender.reduction.reduction_result import Reduction
-from pyklip_diffrender.reduction.words import advice, sentence
 from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.observation import Observation
 

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from pyklip_diffrender.refinement.continuation import align_frame, join_frames, refine_again
-from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.flux_scale import (
+from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, Status
+from pyklip_diffrender.refinement.fitting import (
+    align_frame,
     jansky_per_unit,
+    join_frames,
+    refine,
+    refine_again,
     require_calibrated,
     star_flux_error,
     to_jansky,
     with_star_flux,
 )
-from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.settings import (
     GaussNewton,
     nircam_settings,
     quick_settings,
     settings_for,
 )
-from pyklip_diffrender.refinement.status import Status
 
 __all__ = [
     "FrameFit",

@@ -23,24 +23,407 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+import torch
+from scipy.signal import fftconvolve
+from torch import Tensor
+
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.linear.frames import Unknown
-from pyklip_diffrender.refinement.companions import bright_companions, with_dominant
-from pyklip_diffrender.refinement.conclusion import conclude
-from pyklip_diffrender.refinement.course import NOTHING, Course
-from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.refinement.mode_priors import count_modes_below
-from pyklip_diffrender.refinement.objective import State
-from pyklip_diffrender.refinement.outliers import isolated_outliers
-from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.linear.model import LinearModel, Unknown
+from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, Status, pixel_grid
+from pyklip_diffrender.refinement.forward import Objective, Problem, State
 from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.solver import Solver, StepState
-from pyklip_diffrender.refinement.status import Status
+from pyklip_diffrender.refinement.solver import ModePriors, Solver, StepState, count_modes_below
 from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.star_place import local_maxima
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate
 
-__all__ = ["Annealing"]
+__all__ = [
+    "NOTHING",
+    "Annealing",
+    "Course",
+    "bright_companions",
+    "conclude",
+    "isolated_outliers",
+    "with_dominant",
+]
+
+
+# The course of a fit: its states, and how far it has come.
+
+NOTHING = (math.inf, math.inf)
+"""Model error and chi-squared of no state."""
+
+
+@dataclass
+class Course:
+    """Where a fit is in its schedule.
+
+    Attributes
+    ----------
+    state, best, aligned : State
+        The present one, the one of the least model error, and the one that ended the alignment.
+    carried : StepState
+        What the last step hands on to the next one.
+    settings : GaussNewton
+        Those of the fit, with the size of the drift between frames once it is measured.
+    kappa : float
+        Assumed error of the star model, as a fraction of the star.
+    modes : int
+        Number of leading wavefront modes that are free; 0 for the alignment.
+    remaining : int
+        Number of steps that may follow.
+    error, chi2 : float
+        Model error and chi-squared per pixel of `state`.
+    least : (float, float)
+        Model error and chi-squared per pixel of `best`.
+    may_drop : bool
+        Whether companions may be dropped. They may not after some were added to a fit that had
+        stalled, or it might add and drop them for ever.
+    """
+
+    state: State
+    best: State
+    aligned: State
+    carried: StepState
+    settings: GaussNewton
+    kappa: float
+    modes: int
+    remaining: int
+    error: float = math.inf
+    chi2: float = math.inf
+    least: tuple[float, float] = NOTHING
+    may_drop: bool = True
+
+
+# Bright companions in the residual of a fit.
+#
+# A companion as bright as the speckles of the star biases the fitted wavefront. A companion that is
+# significant in the residual therefore gets its own parameters. Faint planets are found by the
+# detection, which marginalises the wavefront.
+
+_INNER = 0.35
+"""arcsec; closer to the star, the occulter distorts images and the star's errors dominate."""
+
+_APART = 0.15
+"""arcsec, about lambda/D; closer to a known companion, peaks are its own residuals."""
+
+
+def bright_companions(
+    objective: Objective, state: State, kappa: float, *, most: int, threshold: float
+) -> list[Planet]:
+    """Find point sources in the residual of the first frame that is not of a reference star.
+
+    Parameters
+    ----------
+    objective : Objective
+    state : State
+    kappa : float
+        Assumed error of the star model, as a fraction of the star.
+    most : int
+        Largest number of companions.
+    threshold : float
+        Smallest S/N, in units of the scatter (median absolute deviation) of the S/N map.
+
+    Returns
+    -------
+    list of Planet
+        Highest S/N first, at the positions of pixels, in the orientation of the first frame.
+    """
+    has_companions = [each.shows_companions for each in state.unknowns.frames]
+    if most < 1 or True not in has_companions:
+        return []
+    k = has_companions.index(True)
+    point, forward = state.points[k], objective.forwards[k]
+    unknowns, problem, model = point.unknowns, forward.problem, forward.coarse
+    residual = torch.where(problem.valid, problem.data - point.total, 0.0).cpu().numpy()
+    sigma = torch.where(problem.valid, objective.sigma(k, point, kappa), math.inf).cpu().numpy()
+    values = unknowns.values(point.vector)
+    star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
+    axis = values.get("detector_shift", torch.zeros(2, dtype=torch.float64)).cpu()
+    # The template is an image in the middle of the array of a source beyond the occulter.
+    displacement = torch.tensor([1.5, 0.0], dtype=torch.float64)
+    centred = {
+        **values,
+        "star_offset": star + displacement,
+        "detector_shift": -(star + displacement),
+    }
+    with torch.no_grad():
+        image = model(forward.coarse_opd(point), **centred).double().cpu().numpy()
+    template = unknowns.level("flux", point.vector) * image[::-1, ::-1]
+    weight = sigma**-2.0
+    numerator = fftconvolve(residual * weight, template, mode="same")
+    information = fftconvolve(weight, template**2, mode="same")
+    snr = numerator / np.sqrt(np.maximum(information, 1e-300))
+    x, y = (
+        (index - (count - 1) / 2) * scale - float(shift)
+        for index, count, scale, shift in zip(
+            np.indices(residual.shape)[::-1],
+            residual.shape[::-1],
+            model.detector.pixelscale,
+            axis + star,
+            strict=True,
+        )
+    )
+    allowed = (np.hypot(x, y) > _INNER) & np.isfinite(sigma)
+    positions = unknowns.sources(point.vector)[:, 1:] @ unknowns.turn.T
+    for x_known, y_known in positions.tolist():
+        allowed &= np.hypot(x - x_known, y - y_known) > _APART
+    scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
+    return [
+        Planet.from_offset(
+            float(numerator[peak] / information[peak]), float(x[peak]), float(y[peak])
+        ).rotated(-unknowns.roll)
+        for peak in local_maxima(snr, allowed, threshold * scatter, size=7)[:most]
+    ]
+
+
+def with_dominant(objective: Objective, state: State, kappa: float) -> State:
+    """Add the most significant companion, with levels that follow from star and companion together.
+
+    Parameters
+    ----------
+    objective : Objective
+    state : State
+        Whose companion may outshine what the mask leaves of the star, so that its levels are wrong.
+    kappa : float
+        See `bright_companions`.
+    """
+    added = bright_companions(objective, state, kappa, most=1, threshold=0.0)
+    if not added or state.flux <= 0:
+        return state
+    unknowns, vector = state.unknowns.with_companions(added, state.vector)
+    points = objective.at(unknowns, vector).points
+    problems = [forward.problem for forward in objective.forwards]
+    stars = [problem.gain * point.image for problem, point in zip(problems, points, strict=True)]
+    companions = [
+        (point.total - before.total)
+        / (before.unknowns.level("flux", before.vector) * added[0].contrast)
+        for point, before in zip(points, state.points, strict=True)
+    ]
+    k = [each.shows_companions for each in unknowns.frames].index(True)
+    valid = problems[k].valid
+    columns = torch.stack([stars[k], companions[k], torch.ones_like(stars[k])])[:, valid]
+    flux, light, _ = torch.linalg.lstsq(columns.T, problems[k].data[valid]).solution.tolist()
+    if min(flux, light) <= 0:
+        return state
+    vector = vector.clone()
+    vector[unknowns.where("companions")][-3] = light / flux
+    for frame, part, problem, star, companion in zip(
+        unknowns.frames, unknowns.rows, problems, stars, companions, strict=True
+    ):
+        free = set(frame.linear) - set(frame.deviations)
+        names = tuple(name for name in ("flux", "background") if name in free)
+        flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
+        levels = problem.flux_and_background(star + light / flux * companion, flat, names)
+        for name, level in zip(("flux", "background"), levels, strict=True):
+            if name in names:
+                vector[part.rows[frame.where(name)]] = level
+    return objective.at(unknowns, vector)
+
+
+# Bad pixels that the file does not flag.
+#
+# A hot pixel that stands out of the star's image looks like a point source to a matched filter, and
+# in one roll nothing else tells them apart. Its neighbours do: a point source lights several
+# pixels. Two hypotheses are therefore compared for every pixel that deviates, with the star
+# marginalised in both: that it alone is wrong, and that a point source is near it. Near a companion
+# of the fit they are compared twice: in place of the companion, which may be the bad pixel itself,
+# and beside it.
+
+_SIGNIFICANT = 6.0
+"""Deviation of an outlier in standard deviations, of the prediction from all other pixels."""
+
+_BETTER = 1.3
+"""Smallest ratio of the chi-squared that an outlier explains to that of a point source. For bad
+pixels of NIRCam it was 4 to 30. For the brightest pixel of a planet it is below 0.2 in F444W, and
+cannot exceed 1, which it approaches where the image of a point is as sharp as a pixel."""
+
+_DEVIATES = 2.0
+"""Smallest contribution of such a pixel to Sigma^-1 r, which is less than its deviation where the
+fit has taken a part of it."""
+
+_NEAR_COMPANION = 2.0
+"""Pixels between an outlier and a companion that may be nothing else."""
+
+_WRONG = 0.3
+"""Smallest deviation of an outlier beside such a companion, relative to the companion's brightest
+pixel. The model of the companion's image may be wrong by more than the noise, and a second source
+would explain that no better than a single pixel."""
+
+_BATCH = 256
+"""Number of pixels whose deviations are computed at a time."""
+
+_MOST = 50
+"""Largest number of pixels of a frame that are compared, the most deviating first."""
+
+
+def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -> list[Tensor]:
+    """Find pixels that deviate from the model while their neighbours do not.
+
+    Parameters
+    ----------
+    objective : Objective
+    state : State
+    linear : LinearModel
+        About the state, with the full weights of all pixels.
+
+    Returns
+    -------
+    list of Tensor of bool, (ny, nx)
+        For every frame.
+    """
+    companions = {k: (point.total - point.star).cpu() for k, point in enumerate(state.points)}
+    star_only = linear.without("companions", companions)
+    outliers = []
+    for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
+        unknowns = point.unknowns
+        grid = torch.from_numpy(pixel_grid(forward.model, unknowns.values(point.vector)))
+        scale = torch.tensor(forward.model.detector.pixelscale, dtype=torch.float64)
+        companions_at = unknowns.sources(point.vector)[:, 1:] @ unknowns.turn.T
+        steps = torch.linspace(-1.0, 1.0, 5, dtype=torch.float64)
+        beside = torch.cartesian_prod(steps, steps) * scale
+        mask = torch.zeros(grid.shape[:2], dtype=torch.bool)
+        for row, column in _deviating(linear, k):
+            place = grid[row, column]
+            distances = ((companions_at - place) / scale).norm(dim=1)
+            pixel = _single_pixels(mask.shape, torch.tensor([[row, column]]))
+            sources = forward.sources(point, place + beside).cpu()
+            models = [linear]
+            if bool((distances < _NEAR_COMPANION).any()):
+                light = companions[k][max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+                exceeds = float(_amplitude(linear, k, pixel).abs()) > _WRONG * float(light.max())
+                models = [star_only, linear] if exceeds else [star_only]
+            mask[row, column] = any(
+                bool(_explained(model, k, pixel) > _BETTER * _explained(model, k, sources).max())
+                for model in models
+            )
+        outliers.append(mask)
+    return outliers
+
+
+def _deviating(linear: LinearModel, k: int) -> list[tuple[int, int]]:
+    """Row and column of pixels that deviate more than those beside them, the most first."""
+    cleaned = linear.cleaned[k]
+    places = torch.nonzero(cleaned.abs() > _DEVIATES)
+    deviations = torch.zeros_like(cleaned)
+    for start in range(0, len(places), _BATCH):
+        some = places[start : start + _BATCH]
+        explained = _explained(linear, k, _single_pixels(cleaned.shape, some))
+        deviations[some[:, 0], some[:, 1]] = explained.sqrt()
+    peaks = local_maxima(deviations.numpy(), deviations.numpy() > 0, _SIGNIFICANT, size=3)
+    return peaks[:_MOST]
+
+
+def _single_pixels(shape: torch.Size, places: Tensor) -> Tensor:
+    """Images with light in one pixel each, (k, ny, nx), for rows and columns (k, 2)."""
+    images = torch.zeros(len(places), *shape)
+    images[torch.arange(len(places)), places[:, 0], places[:, 1]] = 1.0
+    return images
+
+
+def _amplitude(linear: LinearModel, k: int, templates: Tensor) -> Tensor:
+    """Most probable amplitude of each template in frame k, (templates,)."""
+    products = linear.weigh({k: templates})
+    return products.numerator / products.information.clamp(min=1e-300)
+
+
+def _explained(linear: LinearModel, k: int, templates: Tensor) -> Tensor:
+    """Decrease of chi-squared by each template in frame k, (templates,)."""
+    products = linear.weigh({k: templates})
+    return products.numerator**2 / products.information.clamp(min=1e-300)
+
+
+# The result of a fit: errors of the unknowns about its final state, and the images of the star.
+
+
+def conclude(
+    solver: Solver,
+    settings: GaussNewton,
+    priors: ModePriors,
+    state: State,
+    kappa: float,
+    status: Status,
+    **about: Any,
+) -> Refinement:
+    """Compute errors and make the result.
+
+    Parameters
+    ----------
+    solver : Solver
+    settings : GaussNewton
+        With the prior of the final state.
+    priors : ModePriors
+        With the scales of the final state.
+    state : State
+    kappa : float
+        Error of the star model that errors include, as a fraction of the star.
+    status : Status
+    **about
+        History and duration of the fit.
+    """
+    problems = [forward.problem for forward in solver.objective.forwards]
+    modes = len(solver.basis) if settings.wavefront else 0
+    # Robust weights take a source that is not in the model for an outlier, and a tenth of the light
+    # of one of S/N 7 with it.
+    robust = solver.objective.robust if kappa else math.inf
+    linear = solver.linear_model(state, priors, kappa, modes, robust)
+    update = solver.posterior(state, priors)
+    assert update.variance is not None
+    deviation = update.variance.sqrt()
+    ratios = priors.ratios_if_fixed(update, settings)
+    if status is Status.CONVERGED and priors.are_improbable(ratios):
+        status = Status.PRIOR_MISMATCH
+    frames = []
+    for k, (problem, point) in enumerate(zip(problems, state.points, strict=True)):
+        unknowns = point.unknowns
+        own = deviation[state.unknowns.rows[k].rows[: len(linear.frames[k].rows)]]
+        values = {n: v.cpu().numpy() for n, v in unknowns.values(point.vector).items()}
+        levels = ("flux", "background", *(["pedestal"] if problem.systematics else []))
+        for name in levels:
+            values[name] = unknowns.start[name].numpy()
+        errors = {name: math.nan * value for name, value in values.items()}
+        for name in unknowns.ordered:
+            values[name] = point.vector[unknowns.where(name)].numpy()
+            errors[name] = own[unknowns.where(name)].numpy()
+        frames.append(
+            FrameFit(
+                model=problem.model,
+                observation=problem.observation,
+                start=problem.start,
+                opd=point.opd.cpu().numpy(),
+                star=point.star.cpu().numpy(),
+                companion_image=(point.total - point.star).cpu().numpy(),
+                values=values,
+                errors=errors,
+                gain=problem.gain.cpu().numpy(),
+                coefficients=point.vector[unknowns.where("modes")].numpy(),
+            )
+        )
+    first = state.points[0]
+    companions = state.unknowns.where("companions")
+    return Refinement(
+        frames=tuple(frames),
+        initial=problems[0].initial,
+        settings=settings,
+        basis=solver.basis,
+        status=status,
+        chi2_per_pixel=solver.objective.chi2_per_pixel(state),
+        model_error=kappa,
+        companions=first.unknowns.sources(first.vector).numpy(),
+        companion_errors=deviation[companions].reshape(-1, 3).numpy(),
+        scales=dict(zip(priors.names, priors.scales.tolist(), strict=True)),
+        prior_ratios=ratios,
+        effective_parameters=update.effective,
+        log_evidence=update.log_evidence,
+        stored_linear=linear,
+        systematics=problems[0].systematics,
+        **about,
+    )
+
+
+# Schedule of a fit: alignment first, then the wavefront, with a decreasing model error.
 
 _log = logging.getLogger(__name__)
 

@@ -22,10 +22,9 @@ from torch import Tensor
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.io.keywords import fits_unit
+from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.units import native_float64
-from pyklip_diffrender.linear.frames import LinearFrame, Unknown
-from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.model import LinearFrame, LinearModel, Unknown
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.scene.objects import Planet

@@ -1,11 +1,13 @@
-"""The result of a refinement."""
+"""The result of a refinement: how it ended, and the star in each of its frames."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
+from enum import Enum
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,39 +15,366 @@ from typing import Any
 import numpy as np
 import torch
 from astropy.io import fits
+from astropy.nddata import CCDData
 from astropy.table import QTable
 from astropy.time import Time
 from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
 from pyklip_diffrender.io.files import require_new, write_fits
+from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.io.units import ARCSEC, native_float64
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.refinement.fit_file import (
+    image,
     linear_hdus,
     linear_of,
     model_facts,
     model_of,
+    observation_hdus,
+    observation_of,
     reading,
     text_hdu,
 )
-from pyklip_diffrender.refinement.frame_fit import FrameFit, parameter_table
 from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.refinement.unknowns import brightest
 from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.scene.product_headers import primary_hdu
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import ccd_data, primary_hdu, world_coordinates
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["Refinement"]
+__all__ = [
+    "WHAT_TO_CHECK",
+    "FrameFit",
+    "Refinement",
+    "Status",
+    "breakdown_explained",
+    "parameter_table",
+    "pixel_grid",
+]
+
+
+# How a refinement ended, and the error of one whose linear algebra breaks down.
+
+
+class Status(Enum):
+    """How a refinement ended; the values are the messages.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender import Status
+    >>> [status.name for status in Status if not status.usable]
+    ['DIVERGED']
+    >>> [status.name for status in Status if status.calibrated]
+    ['CONVERGED']
+    >>> print(Status.ITERATION_LIMIT)
+    ITERATION_LIMIT: stopped at the limit of iterations before it converged
+    """
+
+    CONVERGED = "converged, and the model explains the data within their noise"
+    MODEL_MISMATCH = (
+        "converged, but the model does not explain the data: errors include a model error"
+    )
+    PRIOR_MISMATCH = (
+        "converged, but the wavefront is improbable under a prior that was held fixed, so that "
+        "errors are too small; let the prior's scales be fitted (fit_scales=True), or widen them"
+    )
+    ITERATION_LIMIT = "stopped at the limit of iterations before it converged"
+    DIVERGED = "the fitted star has no light, or the loss is not a number"
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.value}"
+
+    @property
+    def message(self) -> str:
+        """Text of the status: its value."""
+        return self.value
+
+    @property
+    def usable(self) -> bool:
+        """Whether the result may be subtracted."""
+        return self is not Status.DIVERGED
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the fit converged to a model that explains the data.
+
+        The errors of the fit then need no factor. `detect` still multiplies those of sources in
+        real frames by the scatter of the S/N, because neighbouring pixels share errors of the model
+        that chi-squared does not show.
+        """
+        return self is Status.CONVERGED
+
+
+WHAT_TO_CHECK = (
+    "Check the star's position in the header (STARCENX/Y, else CRPIX1/2), the filter, the masks "
+    "and the errors, and the unit, the orientation and the date of the wavefront map."
+)
+
+
+@contextmanager
+def breakdown_explained(name: str) -> Iterator[None]:
+    """Turn a breakdown of the linear algebra of a fit into a `RefinementError`.
+
+    Parameters
+    ----------
+    name : str
+        Of the frames, for the message.
+    """
+    try:
+        yield
+    except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+        raise RefinementError(
+            f"{name}: the fit broke down, as it does where the frames show something else than the "
+            f"star that the model renders. {WHAT_TO_CHECK} ({error})"
+        ) from error
+
+
+# The star in one frame of a refinement.
 
 Image = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFit:
+    """The star in one frame of a refinement.
+
+    Attributes
+    ----------
+    model : OpticalSystem
+    observation : Observation
+        The observation; its frames are averaged for the fit. Bad pixels that the fit has left out
+        are not valid.
+    start : dict
+        Starting values of parameters, by name.
+    opd : ndarray, (npix, npix)
+        Best estimate of the wavefront, m, entrance-pupil orientation. Complex if the pupil's
+        amplitude was free: the imaginary part is then an absorption.
+    star : ndarray, (ny, nx)
+        The star and the background, in the unit of the observation.
+    companion_image : ndarray, (ny, nx)
+        Light of the companions that were part of the fit; not part of `star`.
+    values, errors : dict of str to ndarray
+        Every parameter but the wavefront and its standard deviation (NaN where it was not
+        fitted), in the units of the parameter table.
+    gain : ndarray, (ny, nx)
+        Known flat-field pattern, which multiplies the star; 1 without systematics.
+    coefficients : ndarray, (modes,)
+        Coefficients of the wavefront modes, nm.
+    """
+
+    model: OpticalSystem
+    observation: Observation
+    start: dict[str, Any]
+    opd: NDArray[Any]
+    star: Image
+    companion_image: Image
+    values: dict[str, Image]
+    errors: dict[str, Image]
+    gain: Image
+    coefficients: NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        return f"<FrameFit: {self.observation.name}, flux {self.flux:.4g}>"
+
+    @property
+    def flux(self) -> float:
+        """Light of the star that the pupil collects, in the unit of the observation."""
+        return float(self.values["flux"][0])
+
+    @property
+    def pedestal(self) -> float:
+        """Light per pixel that the pattern multiplies besides the star; 0 without a pattern."""
+        return float(self.values["pedestal"][0]) if "pedestal" in self.values else 0.0
+
+    @property
+    def residual(self) -> Image:
+        """Data minus star, (frames, ny, nx); NaN where the data are masked.
+
+        The fit attributes some of the light of other sources to the star, so that it is missing
+        here; `pyklip_diffrender.Detection.subtracted` retains it.
+        """
+        data = self.observation.data - self.star
+        return np.where(self.observation.valid, data, np.nan)
+
+    @property
+    def optical_values(self) -> dict[str, Tensor]:
+        """Values of the model's own parameters, as the model takes them."""
+        return {
+            name: torch.from_numpy(value)
+            for name, value in self.values.items()
+            if name in self.model.parameters
+        }
+
+    @property
+    def grid(self) -> Image:
+        """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
+        return pixel_grid(self.model, self.optical_values)
+
+    @property
+    def wcs(self) -> fits.Header:
+        """World coordinates of the pixels, see `world_coordinates`."""
+        return world_coordinates(self.grid, self.observation)
+
+    def to_ccddata(self) -> CCDData:
+        """The frame without its star as astropy's `CCDData`; integrations are averaged.
+
+        It has the world coordinates, the mask and the errors of the frame; see `residual`.
+        """
+        frame = self.observation.combined()
+        data = frame.data[0] - self.star
+        return ccd_data(
+            data, frame.error[0], frame.unit, self.wcs, frame.valid[0], frame=frame.name
+        )
+
+    def render(
+        self,
+        fov_pixels: int | tuple[int, int] | None = None,
+        center: tuple[float, float] | None = None,
+        *,
+        background: bool = True,
+        source: tuple[float, float] | None = None,
+    ) -> Image:
+        """Render the star on another array of pixels of the same scale.
+
+        Parameters
+        ----------
+        fov_pixels : int or (ny, nx), optional
+            Default the shape of the observation.
+        center : (x, y), optional
+            Pixel of the new array on which the observation's `center` falls. Default the middle
+            of the array.
+        background : bool
+            Add the fitted background.
+        source : (x, y), optional
+            Render a source of the star's flux here instead, arcsec from the model's axis.
+
+        Returns
+        -------
+        ndarray, (ny, nx)
+            In the unit of the observation, without the flat-field pattern.
+        """
+        model, values = self.on_pixels(fov_pixels, center)
+        if source is not None:
+            values["star_offset"] = torch.tensor(source, dtype=torch.float64)
+        with torch.no_grad():
+            image = model(torch.from_numpy(self.opd), **values).double().cpu().numpy()
+        level = float(self.values["background"][0]) if background else 0.0
+        return np.asarray(self.flux * image + level)
+
+    def on_pixels(
+        self,
+        fov_pixels: int | tuple[int, int] | None = None,
+        center: tuple[float, float] | None = None,
+    ) -> tuple[OpticalSystem, dict[str, Tensor]]:
+        """Return the model on another array of pixels, and its parameters; see `render`."""
+        model = self.model
+        if fov_pixels is not None and fov_pixels != self.model.detector.shape:
+            model = model.with_fidelity(fov_pixels=fov_pixels, fov_arcsec=None)
+        values = self.optical_values
+        if center is not None:
+            ny, nx = model.detector.shape
+            old = self.observation.center[0] - (np.array(self.observation.shape[::-1]) - 1) / 2
+            moved = np.array(center) - (np.array([nx, ny]) - 1) / 2 - old
+            shift = torch.from_numpy(moved * np.array(model.detector.pixelscale))
+            values["detector_shift"] = shift + values.get("detector_shift", torch.zeros(2))
+        return model, values
+
+    def to_hdus(self, k: int) -> tuple[dict[str, Any], list[Any]]:
+        """Return metadata and FITS extensions of the frame, with EXTVER k + 1."""
+        observation, hdus = observation_hdus(self.observation, k)
+        unit, wcs = fits_unit(self.observation.unit), self.wcs
+        arrays = {
+            "STAR": (self.star, unit),
+            "COMPANIONS": (self.companion_image, unit),
+            "GAIN": (self.gain, ""),
+            "OPD": (self.opd.real, "m"),
+            "ABSORPTION": (self.opd.imag if np.iscomplexobj(self.opd) else None, "m"),
+            "COEFFICIENTS": (self.coefficients, "nm"),
+        }
+        for name, (array, array_unit) in arrays.items():
+            if array is not None:
+                hdus.append(fits.ImageHDU(array, name=name, ver=k + 1))
+                hdus[-1].header["BUNIT"] = array_unit
+        for hdu in hdus:
+            if hdu.name not in ("OPD", "ABSORPTION", "COEFFICIENTS"):
+                hdu.header.update(wcs)
+        facts = {
+            "observation": observation,
+            "start": self.start,
+            "values": self.values,
+            "errors": self.errors,
+        }
+        return facts, hdus
+
+    @classmethod
+    def from_hdus(
+        cls, hdus: fits.HDUList, facts: dict[str, Any], model: OpticalSystem, k: int
+    ) -> FrameFit:
+        """Make a frame from the metadata and extensions of `to_hdus`."""
+        opd: NDArray[Any] = image(hdus, "OPD", k)
+        if ("ABSORPTION", k + 1) in hdus:
+            opd = opd + 1j * image(hdus, "ABSORPTION", k)
+        values, errors = (
+            {name: np.atleast_1d(value).astype(float) for name, value in facts[key].items()}
+            for key in ("values", "errors")
+        )
+        return cls(
+            model=model,
+            observation=observation_of(hdus, facts["observation"], k),
+            start=facts["start"],
+            opd=opd,
+            star=image(hdus, "STAR", k),
+            companion_image=image(hdus, "COMPANIONS", k),
+            values=values,
+            errors=errors,
+            gain=image(hdus, "GAIN", k),
+            coefficients=image(hdus, "COEFFICIENTS", k),
+        )
+
+
+def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np.float64]:
+    """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
+    detector = model.detector
+    x, y = (
+        (axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC).cpu().numpy()
+        for axis in detector.axes(values)
+    )
+    star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu().numpy()
+    across, up = np.meshgrid(x, y)
+    return np.stack([across - star[0], up + detector.shear * across - star[1]], axis=-1)
+
+
+def parameter_table(frames: Sequence[FrameFit]) -> QTable:
+    """Table of all parameters but the wavefront; see `Refinement.parameters`."""
+    rows = []
+    for k, frame in enumerate(frames):
+        for name, value in frame.values.items():
+            entry = parameter(name)
+            unit = frame.observation.unit.to_string() if entry in LEVELS else entry.unit
+            labels = entry.labels()[: len(value)]
+            parts = zip(value, frame.errors[name], labels, strict=True)
+            for j, (number, error, label) in enumerate(parts):
+                component = name if len(value) == 1 else f"{name}[{j}]"
+                rows.append((k, component, number, error, unit, label))
+    table = QTable(
+        rows=rows,
+        names=("frame", "name", "value", "error", "unit", "description"),
+        dtype=(int, str, float, float, str, str),
+    )
+    for name in ("value", "error"):
+        table[name].info.format = ".5g"
+    return table
+
+
+# The result of a refinement.
 
 _ARRAYS = ("companions", "companion_errors")
 _PLAIN = (
@@ -379,9 +708,9 @@ class Refinement:
         data = np.where(valid, observation.data[0], np.nan)
         north = observation.north
         norm, unit = drawing.light_norm(data, noise[valid]), drawing.unit_label(observation.unit)
-        for each, image, title in ((axes[0], data, "data"), (axes[1], part.star, "star model")):
+        for each, shown, title in ((axes[0], data, "data"), (axes[1], part.star, "star model")):
             drawing.star_image(
-                each, image, part.grid, norm, bar=unit, title=title, north=observation.north
+                each, shown, part.grid, norm, bar=unit, title=title, north=observation.north
             )
         places = observation.turned(self.companions[:, 1:], self.frames[0].observation)
         drawing.signed_image(

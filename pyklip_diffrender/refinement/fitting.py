@@ -1,10 +1,15 @@
-"""`refine`: fit the star in observed frames, starting from a wavefront map."""
+"""`refine`: fit the star in observed frames; fits that continue an earlier one; the star's flux."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
+import torch
+from astropy import units as u
 
 from pyklip_diffrender.errors import (
     IncompatibleSetupError,
@@ -12,18 +17,273 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     ShapeError,
 )
+from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement.continuation import fit_in_stages
-from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.refinement.problem import Problem, starting_values
+from pyklip_diffrender.refinement.annealing import Annealing
+from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, breakdown_explained
+from pyklip_diffrender.refinement.forward import Problem, starting_values
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
-from pyklip_diffrender.refinement.status import breakdown_explained
-from pyklip_diffrender.scene.agreement import require_agreement
+from pyklip_diffrender.scene.admission import require_agreement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import as_opd_map
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["refine"]
+__all__ = [
+    "align_frame",
+    "continue_from",
+    "fit_in_stages",
+    "jansky_per_unit",
+    "join_frames",
+    "refine",
+    "refine_again",
+    "require_calibrated",
+    "star_flux_error",
+    "to_jansky",
+    "with_star_flux",
+]
+
+
+# Fits that continue earlier ones, with more modes or other settings.
+
+_log = logging.getLogger(__name__)
+
+_STRUCTURE = 1.15
+"""Reduced chi-squared above which a fit is repeated with more modes."""
+
+_FOREIGN = 5.0
+"""Reduced chi-squared above which more modes would not help, because the frame shows more than the
+star."""
+
+
+def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Unknown, float]]:
+    """Return the settings and the starting values with which to continue a fit.
+
+    The prior has the final scales of the fit, and the companions are those of the fit.
+
+    Parameters
+    ----------
+    fit : Refinement
+    **changes
+        Fields of `GaussNewton` with other values.
+
+    Returns
+    -------
+    settings : GaussNewton
+    warm : dict of Unknown to float
+        Final values of the unknowns.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the fit was read from a file without its linear model.
+    """
+    settings = fit.settings
+    reached = {
+        "prior": _with_scales(settings.prior, fit.scales, "{}"),
+        "drift": settings.drift and _with_scales(settings.drift, fit.scales, "{} drift"),
+        "dither_drift": settings.dither_drift
+        and _with_scales(settings.dither_drift, fit.scales, "{} dither"),
+        "companions": fit.planets,
+    }
+    warm = dict(zip(fit.linear.unknowns, fit.linear.vector.tolist(), strict=True))
+    return replace(settings, **{**reached, **changes}), warm
+
+
+def _with_scales(prior: WavefrontPrior, scales: Mapping[str, float], label: str) -> WavefrontPrior:
+    """Replace the scales of a prior by those of a fit; other groups keep theirs."""
+    return replace(
+        prior, scales={n: scales.get(label.format(n), scale) for n, scale in prior.scales.items()}
+    )
+
+
+def fit_in_stages(
+    problems: Sequence[Problem],
+    settings: GaussNewton,
+    warm: Mapping[Unknown, float] | None = None,
+    *,
+    progress: bool,
+) -> Refinement:
+    """Refine with the basis of the settings, or the first default basis that explains the data.
+
+    The `cycles` of the result's settings begin with those of the last basis.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        One for each frame.
+    settings : GaussNewton
+    warm : mapping of Unknown to float, optional
+        Starting values.
+    progress : bool
+        Show progress bars.
+    """
+    pupil = problems[0].model.entrance
+    if settings.basis is not None or not settings.cycles:
+        basis = settings.basis or default_basis(pupil=pupil)
+        return Annealing(problems, settings, basis, warm, progress).run()
+    # The number of modes that drift is fixed.
+    grows = settings.wavefront and settings.grow_basis and settings.drift is None
+    cycles_to_try = settings.cycles if grows else settings.cycles[:1]
+    fit: Refinement | None = None
+    for k, cycles in enumerate(cycles_to_try):
+        adapted = replace(settings, cycles=settings.cycles[k:])
+        if fit is not None:
+            _log.info("residuals have structure: adding modes up to %g cycles per pupil", cycles)
+            adapted, warm = continue_from(fit, cycles=settings.cycles[k:])
+        earlier = fit
+        fit = Annealing(problems, adapted, default_basis(cycles, pupil), warm, progress).run()
+        if earlier is not None:
+            seconds, history = earlier.seconds + fit.seconds, earlier.history + fit.history
+            fit = replace(fit, seconds=seconds, history=history)
+        if not fit.status.usable or not _STRUCTURE < fit.reduced_chi2 < _FOREIGN:
+            break
+    assert fit is not None
+    return fit
+
+
+def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> Refinement:
+    """Continue a refinement with other settings.
+
+    Parameters
+    ----------
+    fit : Refinement
+    progress : bool
+        Show progress bars.
+    **changes
+        Fields of `GaussNewton` with other values, such as `companions`.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the fit was read from a file without its linear model.
+    """
+    settings, warm = continue_from(fit, **changes)
+    problems = [
+        Problem(frame.model, frame.observation, fit.initial, frame.start, fit.systematics)
+        for frame in fit.frames
+    ]
+    with breakdown_explained(problems[0].observation.name):
+        again = fit_in_stages(problems, settings, warm, progress=progress)
+    return replace(again, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
+
+
+def align_frame(
+    fit: Refinement,
+    observation: Observation,
+    settings: GaussNewton,
+    *,
+    systematics: Systematics | None,
+) -> Refinement:
+    """Fit place, flux and background of a frame with the wavefront of another fit.
+
+    The Lyot stop, the blur and the internal aberrations are those of the fit, too. Pixels that are
+    bad in all its frames of the same detector pixels are left out.
+
+    Parameters
+    ----------
+    fit : Refinement
+    observation : Observation
+        Of the shape of the fitted frames.
+    settings : GaussNewton
+        Its parameters in `own` are free.
+    systematics : Systematics or None
+        Pattern of the frame.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a frame that cannot share a fit with those of `fit`.
+    NoValidPixelsError, ShapeError
+        For a frame that does not suit the model.
+    """
+    first = fit.frames[0]
+    require_agreement([*(frame.observation for frame in fit.frames), observation])
+    for frame in fit.frames:
+        other = frame.observation
+        if None is not other.first_pixel == observation.first_pixel:
+            known = other.valid.any(axis=0)
+            observation = replace(observation, valid=observation.valid & known)
+    own = tuple(name for name in settings.free if name in settings.own)
+    alone = replace(
+        settings,
+        free=own,
+        own=own,
+        wavefront=False,
+        drift=None,
+        dither_drift=None,
+        companions=(),
+        max_companions=0,
+        deviations={n: d for n, d in settings.deviations.items() if n in own},
+    )
+    shared = {
+        name: value
+        for name, value in first.values.items()
+        if name in fit.model.parameters and name not in own
+    }
+    start = starting_values(fit.model, observation, {})
+    initial = replace(fit.initial, data=fit.wavefront)
+    problem = Problem(fit.model, observation, initial, {**shared, **start}, systematics)
+    with breakdown_explained(observation.name):
+        return fit_in_stages([problem], alone, progress=False)
+
+
+def join_frames(
+    fit: Refinement,
+    others: Sequence[Refinement],
+    settings: GaussNewton,
+    *,
+    systematics: Systematics | None,
+    progress: bool = False,
+) -> Refinement:
+    """Continue a fit with more frames in its likelihood, such as those of reference stars.
+
+    The wavefront of the fit is near that of the new frames. A few steps of all unknowns then take
+    the place of a fit from the map on.
+
+    Parameters
+    ----------
+    fit : Refinement
+    others : sequence of Refinement
+        New frames, aligned with the fit, see `align_frame`.
+    settings : GaussNewton
+        Those of the fit, with a prior on the drift between frames.
+    systematics : Systematics or None
+        Pattern of all frames.
+    progress : bool
+        Show progress bars.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the fit was read from a file without its linear model.
+    """
+    settings, reached = continue_from(replace(fit, settings=settings))
+    own = (*settings.own, "pedestal")
+    count = len(fit.frames)
+    warm = {
+        # A single frame has no unknowns of its own.
+        each._replace(frame=0) if count == 1 and each.name in own else each: value
+        for each, value in reached.items()
+    }
+    for k, other in enumerate(others, count):
+        for name in own:
+            values = other.frames[0].values.get(name, ())
+            warm |= {Unknown(name, i, k): float(value) for i, value in enumerate(values)}
+    problems = [
+        Problem(frame.model, frame.observation, fit.initial, frame.start, systematics)
+        for frame in fit.frames
+    ]
+    for (frame,) in (other.frames for other in others):
+        start = starting_values(fit.model, frame.observation, {})
+        problems.append(Problem(fit.model, frame.observation, fit.initial, start, systematics))
+    with breakdown_explained(problems[0].observation.name):
+        joined = fit_in_stages(problems, settings, warm, progress=progress)
+    return replace(joined, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
+
+
+# `refine`: fit the star in observed frames, starting from a wavefront map.
 
 Start = Mapping[str, Any]
 
@@ -131,3 +391,168 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
             "one for all"
         )
     return list(start)
+
+
+# The flux of the star: from that of a fit to Jansky, and from a catalogue into a fit.
+
+_UNTIED = 0.1
+"""Relative error of the star's flux in real frames if no catalogue says it. Only diffracted light
+is seen, and the prior on the wavefront decides how much of it a star has: fits with a star 10 %
+brighter or fainter explain real frames nearly as well (docs/validation/real_frames.md)."""
+
+_WITHOUT_MAP = 0.4
+"""Relative error for fits that start from a flat wavefront: two rolls of G 7-34 came out 2 % too
+faint in F444W, and 44 % too bright in F356W."""
+
+_HELD = 0.003
+"""Relative deviation of a star's flux from that of a catalogue. The posterior of a fit understates
+the error of the flux, so that a prior as wide as the catalogue's error would hardly move it."""
+
+_AGREES = 0.005
+"""Relative difference of the star's flux from that of a catalogue that is left: a tenth of the
+error of a good catalogue."""
+
+_ROUNDS = 3
+"""Most fits with the flux held, of which each starts from the one before."""
+
+_TIGHTER = 100.0
+"""Factor by which the next of these fits holds the flux more tightly."""
+
+_BRIGHTNESS = u.MJy / u.sr
+
+
+def _pixel_area(observation: Observation) -> float | None:
+    """Solid angle of a pixel, sr, in the photometric calibration; None without calibration."""
+    area = observation.header.get("PIXAR_SR")
+    if not (observation.is_nircam and observation.unit.is_equivalent(_BRIGHTNESS)):
+        return None
+    return area if isinstance(area, float) and area > 0 else None
+
+
+def require_calibrated(observation: Observation) -> None:
+    """Refuse frames without photometric calibration.
+
+    Raises
+    ------
+    IncompatibleSetupError
+    """
+    if _pixel_area(observation) is None:
+        raise IncompatibleSetupError(
+            f"star_flux: {observation.name} is not calibrated: expected a frame of NIRCam in units "
+            "of surface brightness, with PIXAR_SR in its header"
+        )
+
+
+def jansky_per_unit(frame: FrameFit) -> float | None:
+    """Flux density, Jy, of a star of flux 1 in the unit of a fit.
+
+    The fitted flux is the light that the entrance pupil collects, in the unit of the pixels. What
+    the pipeline calibrates is the light of a source far from the occulter, all of its image
+    through the Lyot stop. That is the fitted flux times the transmission of the stop, times the
+    solid angle of a pixel for which the pipeline calculated its surface brightness (PIXAR_SR).
+
+    Returns
+    -------
+    float or None
+        None for frames that are not NIRCam's, that are not in units of surface brightness, or
+        whose header has no PIXAR_SR.
+    """
+    area = _pixel_area(frame.observation)
+    if area is None:
+        return None
+    # A tensor, because the wavefront is complex where the pupil's amplitude was fitted.
+    opd = torch.from_numpy(np.ascontiguousarray(frame.opd))
+    transmission = frame.model.transmission(opd, **frame.optical_values)
+    return float(transmission * area * frame.observation.unit.to(_BRIGHTNESS) * 1e6)
+
+
+def to_jansky(star_flux: float | str | u.Quantity) -> float:
+    """Flux density of a star in Jy, from a number of Jy, a Quantity, an AB magnitude or text.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For anything that is not a positive flux density.
+    """
+    try:
+        value = star_flux if isinstance(star_flux, u.Quantity) else u.Quantity(star_flux)
+        if value.unit == u.dimensionless_unscaled:
+            value = value * u.Jy
+        jansky = float(value.to_value(u.Jy))
+    except (TypeError, ValueError) as error:  # Units that cannot be converted are TypeErrors.
+        raise IncompatibleSetupError(
+            f"star_flux: got {star_flux!r}, expected a flux density such as '0.45 Jy' or "
+            "an AB magnitude (9.8 * u.ABmag)"
+        ) from error
+    if not 0 < jansky < np.inf:
+        raise IncompatibleSetupError(f"star_flux: got {star_flux}, expected a positive number")
+    return jansky
+
+
+def with_star_flux(
+    fit: Refinement,
+    star_flux: float,
+    error: float,
+    *,
+    held: float = _HELD,
+    progress: bool = False,
+) -> Refinement:
+    """Continue a fit with the flux of the star held at that of a catalogue.
+
+    The wavefront then makes up for the change of the diffracted light, so that contrasts refer to
+    the catalogue's star.
+
+    Parameters
+    ----------
+    fit : Refinement
+        Of one star.
+    star_flux : float
+        Flux density in the filter, Jy.
+    error : float
+        Its relative standard deviation, which errors of contrasts then include.
+    held : float
+        Relative deviation from it that the first fit allows.
+    progress : bool
+        Show progress bars.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the frames have no photometric calibration.
+    """
+    for frame in fit.frames:
+        require_calibrated(frame.observation)
+    for _ in range(_ROUNDS):
+        frames = [
+            replace(frame, start={**frame.start, "flux": star_flux / _scale(frame)})
+            for frame in fit.frames
+        ]
+        known = replace(fit, frames=tuple(frames), catalogue_error=error, catalogue_flux=star_flux)
+        deviations = {**fit.settings.deviations, "flux": held}
+        fit = refine_again(known, progress=progress, deviations=deviations)
+        shares = [_scale(frame) * frame.flux / star_flux for frame in fit.frames]
+        if max(abs(share - 1) for share in shares) < _AGREES:
+            break
+        # The light that passes the stop has changed with the wavefront and the pupil's amplitude,
+        # or the frames pull at the flux more than it is held.
+        held /= _TIGHTER
+    return fit
+
+
+def _scale(frame: FrameFit) -> float:
+    scale = jansky_per_unit(frame)
+    assert scale is not None
+    return scale
+
+
+def star_flux_error(fit: Refinement) -> float:
+    """Relative error of the star's flux that is not in the fit's own covariance.
+
+    That of the catalogue, if there is one. Otherwise 10 % for real frames, where only diffracted
+    light tells how bright the star is (40 % without a wavefront map), and 0 for others.
+    """
+    if fit.catalogue_error is not None:
+        return fit.catalogue_error
+    if not fit.frames[0].observation.is_nircam:
+        return 0.0
+    return _UNTIED if fit.initial.data.any() else _WITHOUT_MAP

@@ -1,22 +1,237 @@
-"""The forward model of a fit and its derivatives, at a point of the unknowns."""
+"""The model of a fit: its frames, their images and derivatives, and chi-squared."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import dataclasses
+import logging
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.linear.mode_fields import NANOMETRE
-from pyklip_diffrender.linear.response import coarse_copy, downsample
-from pyklip_diffrender.linear.response_cache import Reading, ResponseCache
+from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
+from pyklip_diffrender.instrument.masks import mask_of_header
+from pyklip_diffrender.io.units import to_number
+from pyklip_diffrender.linear.model import Noise
+from pyklip_diffrender.linear.response import (
+    NANOMETRE,
+    Reading,
+    ResponseCache,
+    coarse_copy,
+    downsample,
+)
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.unknowns import FrameUnknowns
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
+from pyklip_diffrender.scene.exposure import module_of
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.wavefront.opd import OPDMap, resample
 
-__all__ = ["Forward", "Point"]
+__all__ = ["Forward", "Objective", "Point", "Problem", "State", "starting_values"]
+
+
+# A frame to be fitted: data, noise, and the forward model in the data's unit.
+
+_log = logging.getLogger(__name__)
+
+_SCALE_TOLERANCE = 0.02
+"""NIRCam's pixels differ by 1.3 % in x and y, and by 0.7 % from the square ones of stpsf."""
+
+
+@dataclass
+class Problem:
+    """One star image to be explained.
+
+    Frames of an observation that share star and wavefront are averaged first, with their
+    inverse variances as weights.
+
+    Attributes
+    ----------
+    model : OpticalSystem
+    observation : Observation
+        Before the frames are averaged.
+    initial : OPDMap
+        Starting wavefront.
+    start : dict
+        Starting values of optical parameters (numbers in the units of the parameter table, or
+        Quantities), and of "flux" and "background" where known.
+    systematics : Systematics, optional
+        Flat-field pattern of these pixels, with its error.
+    """
+
+    model: OpticalSystem
+    observation: Observation
+    initial: OPDMap
+    start: dict[str, Any] = dataclasses.field(default_factory=dict)
+    systematics: Systematics | None = None
+
+    def __post_init__(self) -> None:
+        if self.observation.shape != self.model.detector.shape:
+            ny, nx = self.model.detector.shape
+            raise ShapeError(
+                f"the observation has {self.observation.shape[0]} x {self.observation.shape[1]} "
+                f"pixels, the model {ny} x {nx}. Cut with observation.cutout({ny}), or make the "
+                "model with fov_pixels to match"
+            )
+        require_same_setup(self.model, self.observation)
+        self.require_parameters(self.start, "start")
+        self.start = dict(self.start)
+        for name in {"flux", "background"} & self.start.keys():
+            unit = self.observation.unit
+            self.start[name] = to_number(self.start[name], unit, f"start: {name}")
+        combined = self.observation.combined()
+        device = self.model.device
+        self.data = torch.from_numpy(combined.data[0]).to(device)
+        self.sigma = torch.from_numpy(combined.error[0]).to(device)
+        self.valid = torch.from_numpy(combined.valid[0]).to(device)
+        if not bool(self.valid.any()):
+            raise NoValidPixelsError(f"{self.observation.name}: all pixels are masked")
+        self.gain = torch.ones_like(self.data)
+        self.gain_error = torch.zeros_like(self.data)
+        self.pedestal = 0.0
+        if self.systematics is not None:
+            pattern, error = self.systematics.at(self.observation)
+            self.gain = 1 + torch.from_numpy(pattern).to(device)
+            self.gain_error = torch.from_numpy(error).to(device)
+            self.pedestal = self.systematics.pedestal
+
+    def leave_out(self, pixels: Tensor) -> None:
+        """Mask pixels, (ny, nx), in all frames of the observation."""
+        if bool(pixels.any()):
+            places = [(x, y) for y, x in torch.nonzero(pixels).tolist()]
+            _log.info("%s: bad pixels (x, y) left out: %s", self.observation.name, places)
+            self.valid = self.valid & ~pixels.to(self.valid.device)
+            self.observation = replace(
+                self.observation, valid=self.observation.valid & ~pixels.cpu().numpy()
+            )
+
+    def starting_opd(self, npix: int) -> Tensor:
+        """The starting wavefront on a pupil array of (npix, npix), m."""
+        opd = resample(self.initial.data, npix)
+        return torch.from_numpy(np.ascontiguousarray(opd)).to(self.model.device)
+
+    @property
+    def has_free_pedestal(self) -> bool:
+        """Whether the known pattern tells how much light it multiplies besides the star."""
+        return self.pedestal > 0 and bool((self.gain != 1).any())
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels that are fitted."""
+        return int(self.valid.sum())
+
+    def optical_start(self, names: tuple[str, ...]) -> dict[str, Tensor]:
+        """Starting values of the named optical parameters and of any given otherwise."""
+        starts = self.model.values(
+            {n: v for n, v in self.start.items() if n in self.model.parameters}
+        )
+        missing = [parameter(name) for name in names if name not in starts]
+        others = self.model.values({p.name: np.full(p.size, p.start) for p in missing})
+        # `values` fills in the model's defaults, which must not replace explicit values.
+        return {**others, **starts}
+
+    def require_parameters(self, names: Iterable[str], argument: str = "free") -> None:
+        """Raise `IncompatibleSetupError` for a name that is no parameter of this problem."""
+        available = (*self.model.parameters, "flux", "background")
+        for name in names:
+            if name not in available:
+                raise IncompatibleSetupError(
+                    f"{argument}: {name!r} is not a parameter of this model, which has {available}"
+                )
+
+    def flux_and_background(
+        self,
+        image: Tensor,
+        sigma: Tensor,
+        names: tuple[str, ...],
+    ) -> tuple[float, float]:
+        """Weighted least-squares flux and background for a rendered star.
+
+        A parameter that is not in `names` keeps its start (flux must then have been given).
+        """
+        weight = torch.where(self.valid, sigma**-2, 0.0)
+        flux = float(self.start.get("flux", 0.0))
+        level = float(self.start.get("background", 0.0))
+        columns = []
+        if "flux" in names:
+            columns.append(image)
+        if "background" in names:
+            columns.append(torch.ones_like(image))
+        target = self.data - (0 if "flux" in names else flux) * image
+        target = target - (0 if "background" in names else level)
+        if columns:
+            design = torch.stack(columns).flatten(1)
+            # Columns of very different size: solve for them in units of their own length.
+            length = torch.sqrt((design**2 * weight.flatten()).sum(dim=1))
+            scaled = design / length[:, None]
+            solution = torch.linalg.solve(
+                (scaled * weight.flatten()) @ scaled.T,
+                (scaled * weight.flatten()) @ target.flatten(),
+            )
+            values = (solution / length).tolist()
+            flux = values[0] if "flux" in names else flux
+            level = values[-1] if "background" in names else level
+        return flux, level
+
+
+def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
+    """Compare filter, masks, module and pixel scale of a model with those of the frames.
+
+    Settings that are unknown on either side, such as those of a system that is not an instrument,
+    are not compared.
+
+    Raises
+    ------
+    IncompatibleSetupError
+    """
+    setup, header = model.setup, observation.header
+    setups = (
+        ("filter", setup.get("filter"), observation.filter),
+        ("image mask", setup.get("image_mask"), header.get("CORONMSK")),
+        ("pupil mask", setup.get("pupil_mask"), header.get("PUPIL")),
+        ("module", setup.get("module"), module_of(header, observation.name)),
+    )
+    for aspect, expected, actual in setups:
+        if not isinstance(expected, str) or not isinstance(actual, str):
+            continue
+        if mask_of_header(actual) != expected.upper():
+            raise IncompatibleSetupError(
+                f"{observation.name}: these frames have {aspect} {actual}, the model {expected}. "
+                "Make the model for the frames, with nircam_coronagraph or from_webbpsf"
+            )
+    ours, theirs = np.array(model.detector.pixelscale), np.array(observation.pixelscale)
+    if (np.abs(theirs / ours - 1) > _SCALE_TOLERANCE).any():
+        raise IncompatibleSetupError(
+            f"{observation.name}: these frames have {observation.pixelscale} arcsec per pixel in "
+            f"(x, y), the model {model.detector.pixelscale}. Make the model with "
+            "pixelscale=observation.pixelscale"
+        )
+
+
+def starting_values(
+    model: OpticalSystem, observation: Observation, start: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Add the position of the star, if the observation has one, to the starting values."""
+    ny, nx = observation.shape
+    displacement = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
+    axis = displacement * np.array(model.detector.pixelscale)
+    if observation.star_offset is not None and "star_offset" in model.parameters:
+        start = {"star_offset": observation.star_offset, **start}
+        # The optical axis goes through the occulter, and the star's image is beside it.
+        axis -= observation.star_offset
+    if "detector_shift" in start or np.abs(axis).max() <= 1e-10:
+        return dict(start)
+    return {**start, "detector_shift": axis}
+
+
+# The forward model of a fit and its derivatives, at a point of the unknowns.
 
 _DIFFERENCE = 5e-4
 """arcsec between images whose difference is a derivative; accurate to 1e-4."""
@@ -323,3 +538,182 @@ class Forward:
                 behind = self.coarse(opd, **{**values, "star_offset": offset - step})
             slopes.append((ahead.double() - behind.double()).cpu() / (2 * _DIFFERENCE))
         return torch.stack(slopes)
+
+
+# Chi-squared of a fit to one or several frames.
+
+_MAX_KAPPA = 10.0
+"""Largest model error, as a fraction of the star."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all unknowns and the images that they render.
+
+    Attributes
+    ----------
+    unknowns : Unknowns
+    vector : Tensor, (unknowns,)
+    points : tuple of Point
+        One for each frame.
+    """
+
+    unknowns: Unknowns
+    vector: Tensor
+    points: tuple[Point, ...]
+
+    @property
+    def flux(self) -> float:
+        """Flux of the star in the first frame."""
+        return self.points[0].unknowns.level("flux", self.points[0].vector)
+
+    def bright_companions(self, kappa: float = 0.0) -> int:
+        """Number of companions, over all frames, that count in Jacobians; see `brightest`."""
+        return sum(len(p.unknowns.bright_sources(p.vector, kappa)) for p in self.points)
+
+    @property
+    def has_star(self) -> bool:
+        """Whether all frames have starlight; without it, no derivative leads back to a star."""
+        return all(point.unknowns.level("flux", point.vector) > 0 for point in self.points)
+
+
+class Objective:
+    """Compares states with the data of all frames.
+
+    Parameters
+    ----------
+    forwards : sequence of Forward
+        One for each frame.
+    robust : float
+        Residuals of this many sigma have half the weight (Cauchy's loss); inf for least squares.
+
+    Attributes
+    ----------
+    shares_pattern : tuple of bool
+        Which frames show the same pixels of the detector, so that the error of the systematics is
+        one unknown in all of them. It is noise of every other frame.
+    """
+
+    def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
+        self.forwards = tuple(forwards)
+        self.shares_pattern = _sharing([forward.problem for forward in self.forwards])
+        self.robust = robust
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of all frames that are fitted."""
+        return sum(forward.problem.pixels for forward in self.forwards)
+
+    def at(self, unknowns: Unknowns, vector: Tensor) -> State:
+        """Render all frames."""
+        points = tuple(
+            forward.at(frame, rows.of_unknowns(vector))
+            for forward, frame, rows in zip(
+                self.forwards, unknowns.frames, unknowns.rows, strict=True
+            )
+        )
+        return State(unknowns, vector, points)
+
+    def sigma(self, frame: int, point: Point, kappa: float) -> Tensor:
+        """Noise and, in quadrature, a model error of the fraction `kappa` of the star."""
+        return torch.sqrt(self.noise(frame, point) ** 2 + (kappa * point.total) ** 2)
+
+    def noise(self, frame: int, point: Point) -> Tensor:
+        """Noise of the data and, in quadrature, the error of the systematics."""
+        problem = self.forwards[frame].problem
+        return torch.hypot(problem.sigma, problem.gain_error * point.multiplied)
+
+    def whitened(self, frame: int, point: Point, sigma: Tensor) -> Tensor:
+        """Residual over `sigma`; 0 where masked."""
+        problem = self.forwards[frame].problem
+        return torch.where(problem.valid, (problem.data - point.total) / sigma, 0.0)
+
+    def errors(self, state: State, kappa: float, robust: float) -> Noise:
+        """Noise of all frames, made robust about a state.
+
+        Parameters
+        ----------
+        state : State
+        kappa : float
+            Assumed error of the star model, as a fraction of the star.
+        robust : float
+            Residual, in standard deviations, of half weight; inf for least squares.
+        """
+        weights = []
+        for k, point in enumerate(state.points):
+            problem = self.forwards[k].problem
+            whole = self.sigma(k, point, kappa)
+            shares = self.shares_pattern[k]
+            own = torch.hypot(problem.sigma, kappa * point.total) if shares else whole
+            weight = torch.where(problem.valid, 1 / own, 0.0)
+            if math.isfinite(robust):
+                # Outliers show against all errors, that of the pattern included.
+                residual = self.whitened(k, point, whole)
+                weight = weight * torch.rsqrt(1 + (residual / robust) ** 2)
+            weights.append(weight)
+        common = [torch.zeros_like(weight) for weight in weights]
+        sharing = [k for k, shares in enumerate(self.shares_pattern) if shares]
+        if sharing:
+            error = self.forwards[sharing[0]].problem.gain_error
+            light = {k: state.points[k].multiplied for k in sharing}
+            seen = sum((weights[k] * light[k]) ** 2 for k in sharing)
+            scale = error / torch.sqrt(1 + error**2 * seen)
+            for k in sharing:
+                common[k] = light[k] * scale
+        return Noise(tuple(weights), tuple(common))
+
+    def residual(self, frame: int, point: Point) -> Tensor:
+        """Data minus model; 0 where masked."""
+        problem = self.forwards[frame].problem
+        return torch.where(problem.valid, problem.data - point.total, 0.0)
+
+    def residuals(self, state: State) -> list[Tensor]:
+        """Data minus model of all frames."""
+        return [self.residual(k, point) for k, point in enumerate(state.points)]
+
+    def chi2(self, state: State, noise: Noise) -> float:
+        """Chi-squared of all frames, with the errors that pixels share marginalised."""
+        return noise.chi2(self.residuals(state))
+
+    def chi2_per_pixel(self, state: State) -> float:
+        """Chi-squared per pixel without a model error."""
+        return self.chi2(state, self.errors(state, 0.0, math.inf)) / self.pixels
+
+    def model_error(self, state: State) -> float:
+        """The model error kappa at which chi-squared per pixel is 1, at least 0 and at most 10."""
+        residuals, noises, stars = [], [], []
+        for k, point in enumerate(state.points):
+            problem = self.forwards[k].problem
+            valid = problem.valid
+            residuals.append((problem.data - point.total)[valid] ** 2)
+            noises.append(self.noise(k, point)[valid] ** 2)
+            stars.append(point.total[valid] ** 2)
+        residual, noise, star = torch.cat(residuals), torch.cat(noises), torch.cat(stars)
+        if float((residual / noise).mean()) <= 1:
+            return 0.0
+        low, high = 0.0, _MAX_KAPPA
+        for _ in range(50):
+            middle = (low + high) / 2
+            too_small = float((residual / (noise + middle**2 * star)).mean()) > 1
+            low, high = (middle, high) if too_small else (low, middle)
+        return high
+
+
+def _sharing(problems: Sequence[Problem]) -> tuple[bool, ...]:
+    """Which frames show the same pixels of the detector with an uncertain pattern.
+
+    Of several such sets the largest shares it, or the first one of two equal ones.
+    """
+    places = [
+        (each.observation.first_pixel, each.observation.shape, id(each.systematics))
+        for each in problems
+    ]
+    known = [
+        place
+        for place, problem in zip(places, problems, strict=True)
+        if place[0] is not None and bool((problem.gain_error > 0).any())
+    ]
+    most = max(known, key=known.count, default=None)
+    if most is None or known.count(most) < 2:
+        return (False,) * len(problems)
+    return tuple(place == most for place in places)

@@ -18,7 +18,7 @@ from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.exposure import image_mask, module_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.real_frames import faintness
+from pyklip_diffrender.scene.simulation import faintness
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
@@ -134,10 +134,10 @@ class GaussNewton:
         result do not include it where the noise explains the residual.
     relinearise : float
         Relative error of derivatives (radians of phase, rms over the pupil) beyond which the
-        response to the wavefront is recomputed, see ``linear.response_cache``.
+        response to the wavefront is recomputed, see ``linear.response``.
     accurate_steps : bool
         Follow a step that fails, gains less than expected or is the last by steps with derivatives
-        of the model itself, see ``pyklip_diffrender.refinement.accurate_step``. Fits of bright
+        of the model itself, see ``pyklip_diffrender.refinement.solver``. Fits of bright
         stars need them; `relinearise` may then be twice as large.
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain

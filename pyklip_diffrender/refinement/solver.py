@@ -10,30 +10,644 @@ fit, with a model error that decreases from step to step, is in `annealing`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.noise import Noise
-from pyklip_diffrender.linear.response_cache import ResponseCache
-from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurate_step
-from pyklip_diffrender.refinement.first_unknowns import first_unknowns
-from pyklip_diffrender.refinement.forward import Forward
-from pyklip_diffrender.refinement.mode_priors import ModePriors
-from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
-from pyklip_diffrender.refinement.objective import Objective, State
-from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.io.units import half_circle
+from pyklip_diffrender.linear.model import (
+    LinearFrame,
+    LinearModel,
+    Noise,
+    pixel_pieces,
+    summed_rows,
+)
+from pyklip_diffrender.linear.response import Reading, ResponseCache
+from pyklip_diffrender.refinement.forward import Forward, Objective, Problem, State
 from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.unknowns import Unknowns
+from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
+from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import Basis
-from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_evidence
+from pyklip_diffrender.wavefront.priors import EvidenceUpdate, scale_ratios, solve_with_evidence
 
-__all__ = ["EquationsCache", "Solver", "Step", "StepState"]
+__all__ = [
+    "EquationsCache",
+    "ModePriors",
+    "ModelDerivatives",
+    "NormalEquations",
+    "Solver",
+    "Step",
+    "StepState",
+    "accurate_step",
+    "conjugate_gradients",
+    "count_modes_below",
+    "first_unknowns",
+    "linearise",
+]
+
+
+# Priors of the modes of a fit: amplitude, wavefront, and its drift between frames.
+
+_IMPROBABLE = 1.5
+"""Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
+
+
+_SAME_SEQUENCE = 2.0 / 24
+"""Days between the beginnings of frames of one exposure sequence: nine dithers of a faint star."""
+
+_SAME_ROLL = 1.0
+"""Degrees by which the roll may differ within an exposure sequence."""
+
+
+def exposure_sequences(observations: Sequence[Observation]) -> list[int]:
+    """Number the exposure sequences that observations belong to.
+
+    Frames of one star at one roll, each begun at most two hours after another one, are of one
+    sequence: the small-grid dithers of a reference star, for example. There is no slew between
+    them. Frames of which date or angle are not known belong to every sequence of their star.
+
+    Returns
+    -------
+    list of int
+        For every observation, from 0 in the order of first appearance.
+    """
+    numbers: list[int] = []
+    for k, each in enumerate(observations):
+        own = [numbers[j] for j in range(k) if _follows(each, observations[j])]
+        numbers.append(own[0] if own else 1 + max(numbers, default=-1))
+    return numbers
+
+
+def _follows(one: Observation, other: Observation) -> bool:
+    """Whether there is no slew between two observations, as far as is known."""
+    if one.target != other.target or one.reference != other.reference:
+        return False
+    dates = [each.date.mjd for each in (one, other) if each.date is not None]
+    if max(dates, default=0.0) - min(dates, default=0.0) > _SAME_SEQUENCE:
+        return False
+    angle, other_angle = one.position_angles, other.position_angles
+    if angle is None or other_angle is None:
+        return True
+    return abs(half_circle(float(angle[0] - other_angle[0]))) <= _SAME_ROLL
+
+
+def count_modes_below(basis: Basis, cycles: float) -> int:
+    """Count the leading modes of a basis whose spatial frequency is at most `cycles`."""
+    beyond = torch.nonzero(basis.frequencies > cycles).flatten()
+    return int(beyond[0]) if len(beyond) else len(basis)
+
+
+@dataclass(frozen=True)
+class ModePriors:
+    """Gaussian priors about zero.
+
+    Attributes
+    ----------
+    amplitude : Tensor, (amplitude modes,)
+        Standard deviations, nm of an imaginary OPD.
+    drift : int
+        Number of leading modes of the wavefront that may differ between frames.
+    blocks : tuple of tuple of int
+        For every frame, the blocks of drift that its wavefront has: the first is that of its
+        exposure sequence or, where frames of a sequence share none, its own.
+    shape : Tensor, (modes + blocks * drift,)
+        Standard deviations of the wavefront's modes relative to the scale of their group.
+    group : Tensor, (modes + blocks * drift,), int64
+        Index of the group.
+    names : tuple of str
+        Names of the groups.
+    scales : Tensor, (groups,)
+        nm. A step of a fit returns others unless they are fixed.
+    """
+
+    amplitude: Tensor
+    drift: int
+    blocks: tuple[tuple[int, ...], ...]
+    shape: Tensor
+    group: Tensor
+    names: tuple[str, ...]
+    scales: Tensor
+
+    @classmethod
+    def of(
+        cls, settings: GaussNewton, basis: Basis, observations: Sequence[Observation]
+    ) -> ModePriors:
+        """Return the priors of a fit to frames of these observations."""
+        prior, drift, dither = settings.prior, settings.drift, settings.dither_drift
+        shape, group, names = [prior.shape(basis)], [basis.group_index], list(basis.groups)
+        scales = [prior.scales[name] for name in basis.groups]
+        drifting, blocks = 0, []
+        if drift is not None and len(observations) > 1:
+            drifting = count_modes_below(basis, settings.drift_cycles)
+            sequences = list(range(len(observations)))
+            if dither is not None:
+                sequences = exposure_sequences(observations)
+            blocks = [[number] for number in sequences]
+            kinds = [(drift, "drift", 1 + max(sequences))]
+            if dither is not None:
+                many = [k for k, each in enumerate(sequences) if sequences.count(each) > 1]
+                for number, k in enumerate(many, 1 + max(sequences)):
+                    blocks[k].append(number)
+                kinds += [(dither, "dither", len(many))] if many else []
+            for kind, label, count in kinds:
+                shape.append(kind.shape(basis)[:drifting].repeat(count))
+                group.append((basis.group_index[:drifting] + len(names)).repeat(count))
+                names += [f"{name} {label}" for name in basis.groups]
+                scales += [kind.scales[name] for name in basis.groups]
+        return cls(
+            prior.amplitude_deviation(basis),
+            drifting,
+            tuple(map(tuple, blocks)),
+            torch.cat(shape),
+            torch.cat(group),
+            tuple(names),
+            torch.tensor(scales, dtype=torch.float64),
+        )
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviations of amplitude, wavefront and drift, in this order."""
+        return torch.cat([self.amplitude, self.scales[self.group] * self.shape])
+
+    def ratios_if_fixed(self, update: EvidenceUpdate, settings: GaussNewton) -> dict[str, float]:
+        """Size of the fitted modes relative to their priors, by group; empty if they are fitted."""
+        is_fixed = settings.wavefront and not settings.prior.fit_scales
+        return self.ratios(update) if is_fixed else {}
+
+    def are_improbable(self, ratios: Mapping[str, float]) -> bool:
+        """Whether the wavefront is too large for its prior."""
+        of_wavefront = [ratios[name] for name in self.names if ratios]
+        return max(of_wavefront, default=0.0) >= _IMPROBABLE
+
+    def ratios(self, update: EvidenceUpdate) -> dict[str, float]:
+        """Size of the fitted modes relative to their priors, by group.
+
+        Parameters
+        ----------
+        update : EvidenceUpdate
+            Of all unknowns of the fit, with their variances.
+        """
+        assert update.variance is not None
+        amplitude = torch.zeros(len(self.amplitude), dtype=torch.int64)
+        group = torch.cat([amplitude, self.group + 1])
+        last = slice(-len(group), None)
+        ratios = scale_ratios(update.step[last], update.variance[last], self.deviation, group)
+        return dict(zip(["amplitude", *self.names], ratios.tolist(), strict=True))
+
+
+# The unknowns of a fit, and the values from which they start.
+
+_PEDESTAL = 0.5
+"""Relative prior deviation of the pedestal of a known pattern."""
+
+_BRIGHT = 0.3
+"""Brightness of pixels where the star is bright, relative to its brightest one."""
+
+
+def first_unknowns(
+    forwards: Sequence[Forward], settings: GaussNewton, basis: Basis, priors: ModePriors
+) -> Unknowns:
+    """The unknowns of frames that are fitted together, before companions are added.
+
+    Flux and background start at their best estimates for the starting wavefront.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the flux has a prior deviation but no starting value.
+    """
+    origin = forwards[0].problem.observation
+    frames = tuple(
+        _frame_unknowns(
+            forward, settings, len(basis), len(priors.amplitude),
+            forward.problem.observation.roll_from(origin),
+        )
+        for forward in forwards
+    )  # fmt: skip
+    own = (*settings.own, "pedestal") if len(frames) > 1 else ()
+    return Unknowns(frames, own, priors.drift, priors.blocks)
+
+
+def _frame_unknowns(
+    forward: Forward, settings: GaussNewton, modes: int, amplitude_modes: int, roll: float
+) -> FrameUnknowns:
+    problem = forward.problem
+    free, deviations = settings.free, dict(settings.deviations)
+    start = problem.optical_start(tuple(n for n in free if n in problem.model.parameters))
+    if problem.has_free_pedestal:
+        free = (*free, "pedestal")
+        deviations["pedestal"] = _PEDESTAL * problem.pedestal
+    zero = torch.zeros(1, dtype=torch.float64)
+    levels = {"flux": zero, "background": zero, "pedestal": zero + problem.pedestal}
+    # The unknowns and their algebra stay on the CPU, wherever the model renders.
+    unknowns = FrameUnknowns(
+        free,
+        {**{n: v.cpu() for n, v in start.items()}, **levels},
+        modes,
+        amplitude_modes,
+        settings.companions,
+        roll,
+        not problem.observation.reference,
+    )
+    image = forward.at(unknowns, unknowns.initial()).image
+    # With photon-noise weights the faint pixels would dominate this first estimate.
+    flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
+    # The flux of a catalogue is that of the target.
+    if problem.observation.reference and "flux" not in problem.start:
+        deviations.pop("flux", None)
+    is_known = "flux" in deviations
+    if is_known and "flux" not in problem.start:
+        raise IncompatibleSetupError(
+            "deviations has 'flux', but start does not: how bright is the star? Give "
+            "start={'flux': ...} in the unit of the frames"
+        )
+    names = tuple(n for n in settings.free if not (is_known and n == "flux"))
+    flux, level = problem.flux_and_background(problem.gain * image, flat, names)
+    if flux <= 0 and "flux" in names:
+        flux = _median_flux(problem, problem.gain * image)
+    if is_known:
+        deviations["flux"] *= flux
+    levels["flux"] = torch.tensor([flux], dtype=torch.float64)
+    levels["background"] = torch.tensor([level], dtype=torch.float64)
+    return replace(unknowns, start={**unknowns.start, **levels}, deviations=deviations)
+
+
+def _median_flux(problem: Problem, image: Tensor) -> float:
+    """Median of the flux by the pixels where the star is bright.
+
+    Least squares give a negative flux where a companion outshines what the mask leaves of the star.
+    """
+    bright = problem.valid & (image > _BRIGHT * image[problem.valid].max())
+    return float((problem.data[bright] / image[bright]).median())
+
+
+# Normal equations of all frames about a state of the fit.
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Normal equations of a state, for the unknowns minus their starting values.
+
+    Attributes
+    ----------
+    state : State
+    kappa : float
+        Assumed error of the star model, as a fraction of the star.
+    robust : float
+        Residual, in standard deviations, of half weight; inf for least squares.
+    curvature : Tensor, (unknowns, unknowns)
+        J C^-1 J^T, with the Jacobian J and the covariance C of the noise, see `Noise`.
+    gradient : Tensor, (unknowns,)
+        J C^-1 r, with the residual r at the starting values.
+    current : Tensor, (unknowns,)
+        Unknowns of the state minus their starting values.
+    frames : tuple of LinearFrame
+    bright_companions : int
+        Number of companions, over all frames, that count in the Jacobians.
+    error : float
+        Largest error of the derivatives, as that of a `Reading`.
+    has_weights : bool
+        Whether curvature and gradient have the present weights of the pixels. If not, only the
+        Jacobians can be used again, and the curvature to precondition.
+    """
+
+    state: State
+    kappa: float
+    robust: float
+    curvature: Tensor
+    gradient: Tensor
+    current: Tensor
+    frames: tuple[LinearFrame, ...]
+    bright_companions: int
+    error: float = 0.0
+    has_weights: bool = True
+
+
+def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """G G^T and G r of the whitened Jacobian G = jacobian * weight.
+
+    Parameters
+    ----------
+    jacobian : Tensor, (rows, pixels), float32
+    weight, residual : Tensor, (pixels,), float64
+        The residual is whitened.
+    """
+    count = len(jacobian)
+    gradient = torch.zeros(count, dtype=torch.float64)
+    # Only one triangle is computed, in place; LAPACK wants columns contiguous.
+    triangle = np.zeros((count, count), order="F")
+    for piece in pixel_pieces(jacobian.shape[1]):
+        white = jacobian[:, piece].double().mul_(weight[piece])
+        gradient += white @ residual[piece]
+        triangle = dsyrk(1.0, white.numpy().T, beta=1.0, c=triangle, trans=1, overwrite_c=1)
+    upper = torch.from_numpy(triangle)
+    return upper + upper.triu(1).T, gradient
+
+
+def linearise(
+    objective: Objective,
+    state: State,
+    kappa: float,
+    modes: int,
+    robust: float,
+    jacobians: Sequence[Tensor] = (),
+    outweighing: float = 0.0,
+    reading: Reading | None = None,
+) -> NormalEquations:
+    """Linearise all frames about a state.
+
+    Parameters
+    ----------
+    objective : Objective
+    state : State
+    kappa : float
+        Assumed error of the star model, as a fraction of the star.
+    modes : int
+        Number of leading wavefront modes that are free; all of them if the wavefront drifts
+        between frames, 0 for the alignment only.
+    robust : float
+        Residual, in standard deviations, of half weight; inf for least squares.
+    jacobians : sequence of Tensor, optional
+        Jacobians of all frames at this state, if they are known.
+    outweighing : float
+        Error of the star model, as a fraction of the star, that decides which companions count in
+        the Jacobians, see `brightest`.
+    reading : Reading, optional
+        Takes the derivatives of the field, where the Jacobians are not known.
+    """
+    size = state.unknowns.with_modes(modes)
+    current = (state.vector - state.unknowns.initial())[:size]
+    curvature = torch.zeros(size, size, dtype=torch.float64)
+    gradient = torch.zeros(size, dtype=torch.float64)
+    frames = []
+    noise = objective.errors(state, kappa, robust)
+    residuals = objective.residuals(state)
+    whitened = noise.inverse(dict(enumerate(residuals)))
+    for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
+        residual, weight, common = (
+            each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k])
+        )
+        rendered = (
+            jacobians[k] if jacobians else forward.jacobian(point, modes, outweighing, reading)
+        )
+        part = state.unknowns.rows[k]
+        rows, first = part.rows[: len(rendered)], part.first_mode
+        drift = part.drift if modes else part.drift[:, :0]
+        frames.append(LinearFrame(rows, drift, first, residual, weight, rendered, common))
+        product, pulled = _accumulate(
+            rendered.flatten(1), weight.flatten(), whitened[k].cpu().flatten()
+        )
+        if len(state.points) == 1:
+            curvature, gradient = product, pulled
+            continue
+        leading = slice(first, first + drift.shape[1])
+        parts = [(rows, slice(None)), *((block, leading) for block in drift)]
+        for to, which in parts:
+            gradient.index_add_(0, to, pulled[which])
+            for onto, selection in parts:
+                curvature[to[:, None], onto] += product[which, selection]
+    if noise.shares_pattern:
+        rows = summed_rows(frames, size)
+        ones = torch.ones(rows.shape[1], dtype=torch.float64)
+        curvature -= _accumulate(rows, ones, ones)[0]
+    gradient = gradient + curvature @ current
+    return NormalEquations(
+        state, kappa, robust, curvature, gradient, current, tuple(frames),
+        state.bright_companions(outweighing), 0.0 if reading is None else reading.farthest,
+    )  # fmt: skip
+
+
+# Gauss-Newton steps with derivatives of the model itself, by conjugate gradients.
+#
+# Normal equations of a coarse copy of the model are wrong where the effects of several unknowns
+# cancel, and steps along such directions are too long. Products of the model's own curvature with a
+# vector take as long as three images. The coarse copy's equations precondition them, and may be
+# those of an earlier step.
+
+_ITERATIONS = 6
+_SUFFICIENT = 0.05
+
+_ROUNDING = 1e-12
+"""Relative error of the curvature's elements."""
+
+_DIFFERENCE = 0.01
+"""Part of a step between the images whose difference is a derivative. Their curvature matters less
+than the rounding errors of single precision."""
+
+
+class ModelDerivatives:
+    """Gradient and curvature of chi-squared, by derivatives of the model itself.
+
+    The gradient is that of all light. In the curvature, which determines the path to the minimum
+    and not its place, the light of faint companions is linear: it depends on their contrasts and
+    positions and on the star's flux, and not on the wavefront.
+
+    Parameters
+    ----------
+    objective : Objective
+    state : State
+    noise : Noise
+        Of all frames.
+    """
+
+    def __init__(self, objective: Objective, state: State, noise: Noise) -> None:
+        self._objective, self._state, self._noise = objective, state, noise
+        self._levels = [
+            forward.levels(point, point.unknowns.visible_sources(point.vector)).double()
+            for forward, point in zip(objective.forwards, state.points, strict=True)
+        ]
+        self._bright = [point.unknowns.are_bright(point.vector) for point in state.points]
+        self._without_faint = [
+            point if bool(bright.all()) else forward.at(point.unknowns, point.vector, bright)
+            for forward, point, bright in zip(
+                objective.forwards, state.points, self._bright, strict=True
+            )
+        ]
+
+    def gradient(self) -> Tensor:
+        """Minus half the derivative of chi-squared, (unknowns,)."""
+        sources = [point.unknowns.visible_sources(point.vector) for point in self._state.points]
+        return self._pull(dict(enumerate(self._objective.residuals(self._state))), sources)
+
+    def product(self, step: Tensor) -> Tensor:
+        """Product of the curvature with a step, (unknowns,)."""
+        vector, images, sources = self._state.vector + _DIFFERENCE * step, {}, []
+        for k, before in enumerate(self._without_faint):
+            rows, bright = self._state.unknowns.rows[k], self._bright[k]
+            after = self._objective.forwards[k].at(
+                before.unknowns, rows.of_unknowns(vector), bright
+            )
+            images[k] = (after.total - before.total) / _DIFFERENCE
+            if not bool(bright.all()):
+                images[k] = images[k] + self._change_of_faint(k, rows.of_unknowns(step))
+            sources.append(before.unknowns.visible_sources(before.vector)[bright])
+        return self._pull(images, sources)
+
+    def _change_of_faint(self, k: int, step: Tensor) -> Tensor:
+        """Change of the light of faint companions in a frame by a step of its unknowns."""
+        point = self._state.points[k]
+        unknowns, faint = point.unknowns, ~self._bright[k]
+        of_companions = step[unknowns.where("companions")]
+        rows = self._levels[k][-len(of_companions) :].unflatten(0, (-1, 3))[faint].flatten(0, 1)
+        change = torch.tensordot(of_companions.reshape(-1, 3)[faint].flatten(), rows, dims=1)
+        light = point.total - self._without_faint[k].total
+        change_of_flux = unknowns.level("flux", step) if "flux" in unknowns.linear else 0.0
+        relative = change_of_flux / unknowns.level("flux", point.vector)
+        return relative * light + change.to(light.device)
+
+    def _pull(self, images: Mapping[int, Tensor], sources: Sequence[Tensor]) -> Tensor:
+        """Product of the whitened Jacobian with images of all frames, which it whitens as well.
+
+        The Jacobian by optics and wavefront is that of the star and of `sources`, (k, 3) by frame.
+        """
+        objective, unknowns = self._objective, self._state.unknowns
+        total = torch.zeros(unknowns.size, dtype=torch.float64)
+        whitened = self._noise.inverse(images)
+        for k, (forward, point) in enumerate(
+            zip(objective.forwards, self._state.points, strict=True)
+        ):
+            pixels = self._noise.weight[k] * whitened[k]
+            where, levels = point.unknowns.slices, self._levels[k]
+            of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
+            last = where["companions"].stop
+            of_frame[last - len(levels) : last] = levels.flatten(1) @ pixels.cpu().flatten()
+            for name, slopes in forward.slopes(point, pixels, sources[k]).items():
+                of_frame[where[name]] = slopes
+            total += unknowns.rows[k].onto_unknowns(of_frame, unknowns.size)
+        return total
+
+
+def accurate_step(
+    derivatives: ModelDerivatives,
+    curvature: Tensor,
+    offset: Tensor,
+    deviation: Tensor,
+    enough: float,
+    *,
+    iterations: int = _ITERATIONS,
+    sufficient: float = _SUFFICIENT,
+) -> tuple[Tensor, bool]:
+    """Compute the step to the minimum of the linearised penalised chi-squared.
+
+    Parameters
+    ----------
+    derivatives : ModelDerivatives
+    curvature : Tensor, (some, some)
+        Approximate curvature by the leading unknowns, the only ones that the step changes.
+    offset : Tensor, (unknowns,)
+        Unknowns of the state minus the means of their priors.
+    deviation : Tensor, (unknowns,)
+        Prior standard deviations.
+    enough : float
+        Decrease of the penalised chi-squared that does not matter.
+    iterations, sufficient
+        See `conjugate_gradients`.
+
+    Returns
+    -------
+    step : Tensor, (unknowns,)
+    settled : bool
+        Whether another iteration would hardly have lowered chi-squared.
+    """
+    count = len(curvature)
+    precision = deviation[:count] ** -2
+    # Unknowns differ by many powers of ten, so the system is solved in scaled units.
+    unit = (curvature.diagonal() + precision).clamp(min=1e-300) ** -0.5
+    system = (curvature * unit[:, None]).mul_(unit)
+    system.diagonal().mul_(1 + _ROUNDING).add_(precision * unit**2)
+    factor = torch.linalg.cholesky(system)
+    step = torch.zeros_like(offset)
+
+    def product(scaled: Tensor) -> Tensor:
+        step[:count] = unit * scaled
+        return unit * (derivatives.product(step)[:count] + precision * step[:count])
+
+    def precondition(scaled: Tensor) -> Tensor:
+        return torch.cholesky_solve(scaled[:, None], factor)[:, 0]
+
+    gradient = derivatives.gradient()[:count] - precision * offset[:count]
+    scaled, settled = conjugate_gradients(
+        product, precondition, unit * gradient, enough, iterations, sufficient
+    )
+    step[:count] = unit * scaled
+    return step, settled
+
+
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    gradient: Tensor,
+    enough: float = 0.0,
+    iterations: int = _ITERATIONS,
+    sufficient: float = _SUFFICIENT,
+) -> tuple[Tensor, bool]:
+    """Minimise x A x - 2 g x approximately.
+
+    Every iteration lowers it, however poor the preconditioner is; a few are sufficient where that
+    is wrong in a few directions only. SciPy's `cg` ends by the size of the gradient, which says
+    little where unknowns are nearly degenerate.
+
+    Parameters
+    ----------
+    product : callable
+        A x, with a positive definite matrix A.
+    precondition : callable
+        B^-1 x, with an approximation B to A.
+    gradient : Tensor, (n,)
+        g.
+    enough : float
+        Decrease below which that of one iteration is the last.
+    iterations : int
+        Largest number of iterations.
+    sufficient : float
+        Part of the whole decrease below which that of one iteration is the last.
+
+    Returns
+    -------
+    x : Tensor, (n,)
+    settled : bool
+        Whether another iteration would hardly have lowered it.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from pyklip_diffrender.refinement.solver import conjugate_gradients
+    >>> matrix = torch.tensor([[2.0, 1.0], [1.0, 3.0]])
+    >>> conjugate_gradients(lambda x: matrix @ x, lambda x: x, torch.tensor([3.0, 4.0]))
+    (tensor([1.0000, 1.0000]), True)
+    """
+    x = torch.zeros_like(gradient)
+    remaining = gradient.clone()
+    direction = precondition(remaining)
+    power, total = float(remaining @ direction), 0.0
+    for _ in range(iterations):
+        if power <= 0:
+            return x, True
+        # What the preconditioner expects does not tell the decrease. Errors of its Jacobian count
+        # as curvature along a direction in which the effects of unknowns cancel.
+        pulled = product(direction)
+        curvature = float(direction @ pulled)
+        if curvature <= 0:  # By rounding errors.
+            return x, True
+        x += power / curvature * direction
+        remaining -= power / curvature * pulled
+        decrease = power**2 / curvature
+        total += decrease
+        if decrease < max(sufficient * total, enough):
+            return x, True
+        ahead = precondition(remaining)
+        power, before = float(remaining @ ahead), power
+        direction = ahead + power / before * direction
+    return x, False
+
+
+# Damped Gauss-Newton steps on the unknowns of a fit.
 
 _TRIES = 7
 """Largest number of attempts at a step, with increasing damping. The last has a damping of 2,300:

@@ -17,8 +17,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.io.geometry import rotation_matrix
-from pyklip_diffrender.linear.frames import FrameRows, Unknown
+from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.linear.model import FrameRows, Unknown
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.scene.objects import Planet
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from pyklip_diffrender.scene.detector_pixels import shift_frames
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
-from pyklip_diffrender.scene.measured_noise import calibrated_errors
+from pyklip_diffrender.scene.integrations import calibrated_errors
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, shift_frames
 from pyklip_diffrender.scene.objects import (
     ALPHA_PICTORIS_W2,
     PAPER_SEGMENT_GAP,
@@ -15,10 +14,10 @@ from pyklip_diffrender.scene.objects import (
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import world_coordinates
-from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.simulation import (
     expected_photons,
+    model_for,
     planet_photons,
     simulate,
     star_photons,

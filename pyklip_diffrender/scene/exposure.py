@@ -1,4 +1,4 @@
-"""The exposure of a file, as its header describes it.
+"""The exposure of a file and the star that it shows, as header and file name describe them.
 
 No card has a default here: a value that is not stated is None, and whoever needs it has to say so.
 """
@@ -8,35 +8,204 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from astropy import units as u
 from astropy.io import fits
 from astropy.time import Time
 
 from pyklip_diffrender.errors import CorruptFileError
-from pyklip_diffrender.io.geometry import full_circle, half_circle
 from pyklip_diffrender.io.headers import (
     card_error,
     day_and_time,
     header_date,
     header_number,
     header_text,
+    same_name,
 )
-from pyklip_diffrender.scene.archive_names import detector_of, identity_of, level_of
-from pyklip_diffrender.scene.catalogue_star import CatalogueStar, star_of
+from pyklip_diffrender.io.units import full_circle, half_circle
 
 __all__ = [
+    "CatalogueStar",
     "Exposure",
     "bar_place",
     "beginning",
+    "detector_of",
+    "identity_of",
     "image_mask",
     "instrument_of",
     "is_reference",
+    "level_of",
     "middle",
     "module_of",
     "position_angle",
+    "proper_motion",
+    "star_of",
 ]
+
+
+# The names of files in the archive: the product, the exposure, and the detector.
+
+_LEVEL = re.compile(r"_([a-z0-9]+)\.fits(\.gz)?$", re.IGNORECASE)
+_LEVELS = (
+    "calints", "crfints", "cal", "crf", "rateints", "rate", "uncal", "ramp", "jump", "dark",
+    "trapsfilled", "i2d", "s2d", "psfsub", "psfalign", "psfstack", "x1d", "segm", "cat",
+)  # fmt: skip
+"""Products of the pipeline: those that can be used come first, the best of them in front."""
+
+_STEPS = {"S_KLIP": "psfsub", "S_PSFALI": "psfalign", "S_PSFSTK": "psfstack", "S_RESAMP": "i2d"}
+"""Steps of the pipeline after which frames are no longer those of a detector."""
+
+_NAME = re.compile(
+    r"jw(\d{5})(\d{3})(\d{3})_(\d{2})(\d)(\w{2})_(\d{5})(?:-seg(\d{3}))?_([a-z0-9]+)", re.IGNORECASE
+)
+"""Programme, observation, visit, visit group, parallel sequence, activity, exposure, segment and
+detector in the name that the archive gives to a file."""
+
+_IDENTITY = ("PROGRAM", "OBSERVTN", "VISIT", "VISITGRP", "SEQ_ID", "ACT_ID", "EXPOSURE")
+
+_DETECTORS = {"NRCA5": "NRCALONG", "NRCB5": "NRCBLONG"}
+"""Detectors whose apertures (APERNAME) have another name."""
+
+
+def level_of(header: fits.Header, name: str, dimensions: int) -> str | None:
+    """Product of the pipeline, from its steps, the unit, and the names of the file."""
+    for key, level in _STEPS.items():
+        if str(header.get(key, "")).strip().upper() == "COMPLETE":
+            return level
+    texts = (Path(name).name, header_text(header, "FILENAME", name) or "")
+    named = [match[1].lower() for match in map(_LEVEL.search, texts) if match]
+    known = [each for each in named if each in _LEVELS]
+    # If the names disagree, the frames are what they are least useful as.
+    stated = max(known, key=_LEVELS.index, default=None)
+    unit = (header_text(header, "BUNIT", name) or "").upper().replace(" ", "")
+    if unit in ("DN/S", "ADU/S", "COUNT/S") and stated in (None, "calints", "cal"):
+        return "rateints" if dimensions == 3 else "rate"
+    if stated == "calints" and dimensions == 2:
+        return "cal"
+    return stated
+
+
+def detector_of(header: fits.Header, name: str) -> str | None:
+    """Detector, from DETECTOR, APERNAME or the archive's name of the file; None if not stated."""
+    stated = header_text(header, "DETECTOR", name)
+    if stated is not None:
+        return stated.upper()
+    aperture = (header_text(header, "APERNAME", name) or "").upper().partition("_")[0]
+    if re.fullmatch(r"NRC[AB]\d", aperture):
+        return _DETECTORS.get(aperture, aperture)
+    match = _NAME.search(Path(name).name)
+    return match[9].upper() if match else None
+
+
+def identity_of(header: fits.Header, name: str) -> str | None:
+    """Name of the exposure, as the archive makes it; None if the header does not say."""
+    detector = detector_of(header, name)
+    parts = [str(header.get(key, "")).strip() for key in _IDENTITY]
+    if detector is not None and all(each and each.upper() != "UNKNOWN" for each in parts):
+        digits = [part.zfill(n) for part, n in zip(parts, (5, 3, 3, 2, 1, 2, 5), strict=True)]
+        segment = header_number(header, "EXSEGNUM", name) or 1
+        return _identified(digits, f"{segment:03.0f}", detector)
+    for text in (header_text(header, "FILENAME", name) or "", Path(name).name):
+        match = _NAME.search(text)
+        if match:
+            *digits, part, chip = match.groups()
+            return _identified(digits, part or "001", chip)
+    return None
+
+
+def _identified(digits: list[str], segment: str, detector: str) -> str:
+    program, observation, visit, group, sequence, activity, exposure = digits
+    part = "" if segment == "001" else f"-seg{segment}"
+    return (
+        f"jw{program}{observation}{visit}_{group}{sequence}{activity}_{exposure}{part}_"
+        f"{detector.lower()}"
+    )
+
+
+# Stars as headers describe them: names, coordinates and proper motion.
+
+_COORDINATES: tuple[tuple[str, str], ...] = (("TARG_RA", "TARG_DEC"), ("RA_REF", "DEC_REF"))
+"""Cards of the star's coordinates, and of where the telescope pointed."""
+
+_SAME_PLACE = 5.0
+"""arcsec between the coordinates of one star in two headers. They may be those of a catalogue's
+epoch in one, and of the exposure in the other."""
+
+_SAME_POINTING = 60.0
+"""arcsec between the coordinates of one star if its names agree, or if one of the two is where the
+telescope pointed."""
+
+
+@dataclass(frozen=True)
+class CatalogueStar:
+    """A star as a header describes it.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The proposer's (TARGPROP) and the catalogue's (TARGNAME), where stated.
+    coordinates : tuple of float or None
+        Right ascension and declination, degrees.
+    pointing : bool
+        Whether these are the coordinates at which the telescope pointed, for want of the star's.
+    """
+
+    names: tuple[str, ...] = ()
+    coordinates: tuple[float, float] | None = None
+    pointing: bool = False
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the header says which star it is."""
+        return bool(self.names or self.coordinates)
+
+    def is_called(self, name: str) -> bool:
+        """Whether one of the names is this one, in any spelling."""
+        return any(same_name(name, each) for each in self.names)
+
+    def separation(self, other: CatalogueStar) -> float | None:
+        """Arcsec between the coordinates of two headers; None if one has none."""
+        if self.coordinates is None or other.coordinates is None:
+            return None
+        (a, d), (b, e) = np.deg2rad([self.coordinates, other.coordinates])
+        # The haversine formula, which keeps its digits at small angles.
+        half = np.sin((e - d) / 2) ** 2 + np.cos(d) * np.cos(e) * np.sin((b - a) / 2) ** 2
+        return float(np.rad2deg(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1)))) * 3600)
+
+    def is_same(self, other: CatalogueStar) -> bool:
+        """Whether two headers describe one star: coordinates decide, names where there are none."""
+        alike = any(other.is_called(name) for name in self.names)
+        apart = self.separation(other)
+        if apart is None:
+            return alike
+        coarse = alike or self.pointing or other.pointing
+        return apart < (_SAME_POINTING if coarse else _SAME_PLACE)
+
+
+def star_of(header: fits.Header, name: str) -> CatalogueStar:
+    """Read which star a header names, and where it is."""
+    names = [header_text(header, key, name) for key in ("TARGPROP", "TARGNAME")]
+    for keys in _COORDINATES:
+        place = [header_number(header, key, name) for key in keys]
+        # Files without a target have zeros.
+        if None not in place and any(place):
+            ra, dec = (float(each or 0.0) for each in place)
+            if not -90 <= dec <= 90:
+                raise card_error(name, keys[1], dec, "a declination in degrees")
+            return CatalogueStar(tuple(filter(None, names)), (ra, dec), keys != _COORDINATES[0])
+    return CatalogueStar(tuple(filter(None, names)))
+
+
+def proper_motion(header: fits.Header, name: str) -> tuple[float, float] | None:
+    """Proper motion of the star, arcsec per year (MU_RA, which includes cos Dec, and MU_DEC)."""
+    east, north = (header_number(header, key, name) for key in ("MU_RA", "MU_DEC"))
+    return None if east is None or north is None else (east, north)
+
+
+# The exposure of a file, as its header describes it.
 
 _MASK = re.compile(r"(?<![A-Z0-9])(?:SUB\d+|MASK)?[AB]?(?:MASK)?(\d{3}R|LWB|SWB)(?![A-Z0-9])")
 """A mask in CORONMSK (MASKA335R), APERNAME (NRCA5_MASK335R) or SUBARRAY (SUB320A335R)."""

@@ -1,4 +1,4 @@
-"""Compare the integrations of a file, and leave out what deviates from the others.
+"""The integrations of a file: checks of their arrays, which of them deviate, and their noise.
 
 All integrations of an exposure show the same star through nearly the same wavefront. One that is
 empty, or has the afterglow of an earlier exposure, would spoil the average.
@@ -6,25 +6,188 @@ empty, or has the afterglow of an earlier exposure, would spoil the average.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from astropy import units as u
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, uniform_filter
+from scipy.ndimage import binary_dilation, convolve, uniform_filter
 from scipy.stats import median_abs_deviation
 
-from pyklip_diffrender.io.geometry import half_circle
+from pyklip_diffrender.errors import (
+    IncompatibleSetupError,
+    NoValidPixelsError,
+    ShapeError,
+    UnitError,
+)
+from pyklip_diffrender.io.units import (
+    half_circle,
+    require_finite,
+    require_shape,
+    to_arcsec,
+    to_mask,
+    to_pair,
+    to_unit,
+)
 
 __all__ = [
     "Judgement",
+    "calibrated_errors",
+    "checked_frames",
+    "checked_stacks",
     "compressed",
+    "dark_pixels",
     "empty_integrations",
     "judge_integrations",
     "judge_pointings",
+    "mask_unusable",
     "pointings",
+    "selected",
+    "usable_pixels",
+    "weighted_mean",
+    "why_odd_noise",
 ]
+
+
+# Checks of the arrays and numbers that an observation is made of.
+
+
+def checked_frames(
+    data: Any,
+    error: Any,
+    *,
+    valid: Any = None,
+    unit: str | u.UnitBase = "photon",
+    pixelscale: float | tuple[float, float],
+    center: Any = None,
+    **details: Any,
+) -> dict[str, Any]:
+    """Return the attributes of an `Observation`, checked, in its units, and copied.
+
+    The arguments are those of `Observation.from_arrays`, which says what is raised.
+    """
+    name = details.get("name", "observation")
+    unit = _unit(unit, name)
+    frames = checked_stacks(
+        to_unit(data, unit, f"{name}: data"),
+        to_unit(error, unit, f"{name}: error"),
+        valid=None if valid is None else to_mask(valid, f"{name}: valid"),
+        unit=unit,
+        pixelscale=pixelscale,
+        center=center,
+        **details,
+    )
+    mask_unusable(frames)
+    return frames
+
+
+def _unit(unit: Any, name: str) -> u.UnitBase:
+    try:
+        return u.Unit(unit)
+    except (ValueError, TypeError) as reason:
+        raise UnitError(
+            f"{name}: got the unit {unit!r}, expected an astropy unit such as 'MJy/sr'"
+        ) from reason
+
+
+def usable_pixels(
+    data: NDArray[Any], error: NDArray[Any], valid: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Valid pixels of a frame, (ny, nx), that are finite and have an error."""
+    return np.asarray(valid & np.isfinite(data) & np.isfinite(error) & (error > 0))
+
+
+def mask_unusable(frames: Mapping[str, Any], valid: NDArray[np.bool_] | None = None) -> None:
+    """Set data to 0, errors to 1 and valid to False where pixels cannot be used, in place.
+
+    The arrays of `frames`, and `valid`, which says what else is not to be used, are
+    (frames, ny, nx). Frame by frame, which takes no memory.
+    """
+    for k, (data, error, good) in enumerate(
+        zip(frames["data"], frames["error"], frames["valid"], strict=True)
+    ):
+        good &= usable_pixels(data, error, good if valid is None else valid[k])
+        data[~good], error[~good] = 0.0, 1.0
+
+
+def checked_stacks(
+    data: NDArray[Any],
+    error: NDArray[Any],
+    *,
+    valid: NDArray[np.bool_] | None = None,
+    unit: str | u.UnitBase,
+    pixelscale: float | tuple[float, float],
+    center: Any = None,
+    **details: Any,
+) -> dict[str, Any]:
+    """Return the attributes of an `Observation`, checked, with the caller's own arrays.
+
+    `mask_unusable` sets what cannot be used to the values that an `Observation` has there.
+    """
+    name = details.get("name", "observation")
+    unit = _unit(unit, name)
+    values = data[None] if data.ndim == 2 else data
+    if values.ndim != 3 or values.size == 0:
+        raise ShapeError(f"{name}: data: got shape {np.shape(data)}, expected ([frames,] ny, nx)")
+    sigma = error[None] if error.ndim == 2 else error
+    require_shape(sigma, values.shape, f"{name}: error", "Give one error for every pixel")
+    mask = np.ones(values.shape, dtype=bool) if valid is None else valid
+    mask = mask[None] if mask.ndim == 2 else mask
+    require_shape(mask, values.shape, f"{name}: valid", "Give one value for every pixel")
+    for k, each in enumerate(map(usable_pixels, values, sigma, mask)):
+        if not each.any():
+            raise NoValidPixelsError(
+                f"{name}: all {each.size} pixels of frame {k} are masked, not "
+                "finite or without an error. Look at its DQ"
+            )
+    if details.get("star_offset") is not None:
+        details["star_offset"] = to_pair(details["star_offset"], u.arcsec, "star_offset")
+    if details.get("position_angles") is not None:
+        angles = to_unit(details["position_angles"], u.deg, "position_angles")
+        details["position_angles"] = _spread(angles, (len(values),), f"{name}: position_angles")
+    frames, ny, nx = values.shape
+    middle = [(nx - 1) / 2, (ny - 1) / 2]
+    position = to_unit(middle if center is None else center, u.pix, f"{name}: center")
+    require_finite(position, f"{name}: center")
+    scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), f"{name}: pixelscale")
+    if not (np.isfinite(scale) & (scale > 0)).all():
+        raise IncompatibleSetupError(
+            f"{name}: pixelscale: got {pixelscale}, expected a positive number of arcsec per "
+            "pixel, such as 0.0624"
+        )
+    return {
+        "data": values,
+        "error": sigma,
+        "valid": mask,
+        "unit": unit,
+        "pixelscale": (float(scale[0]), float(scale[1])),
+        "center": _spread(position, (frames, 2), f"{name}: center"),
+        **details,
+    }
+
+
+def selected(frames: Mapping[str, Any], which: NDArray[np.intp]) -> dict[str, Any]:
+    """The attributes of an `Observation` that change if frames are selected by their indices."""
+    names = ("data", "error", "valid", "center", "position_angles")
+    counted = {name: frames.get(name, ()) for name in ("noise_ratios", "integrations")}
+    return {
+        **{name: frames[name][which] for name in names if frames[name] is not None},
+        **{name: tuple(each[k] for k in which) if each else () for name, each in counted.items()},
+    }
+
+
+def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
+    """Copy of an array, repeated to a shape."""
+    try:
+        return np.broadcast_to(array, shape).copy()
+    except ValueError as error:
+        raise ShapeError(f"{name}: got shape {array.shape}, expected {shape}") from error
+
+
+# Compare the integrations of a file, and leave out what deviates from the others.
 
 Stack = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -283,3 +446,233 @@ def pointings(center: Stack, angles: NDArray[np.float64] | None) -> Iterator[NDA
         group = left & (apart <= _SAME_PLACE) & (turned <= _SAME_ANGLE)
         left &= ~group
         yield np.flatnonzero(group)
+
+
+# Noise of real frames, measured where there is no starlight.
+#
+# The errors in the ERR extension of coadded JWST frames may be wrong by up to a factor of two in
+# the part that does not depend on the light (read noise and background). That part is measured here
+# on the frame itself, far from the star.
+
+_log = logging.getLogger(__name__)
+
+Image = NDArray[np.float64]
+
+_FAR = 6.0
+"""arcsec from the star beyond which its light adds no noise. Closer than that a bright star's light
+still shows in differences of neighbouring pixels."""
+
+_ENOUGH = 2000
+"""Number of far pixels below which the errors are left as they are."""
+
+_PLAUSIBLE = (0.1, 5.0)
+"""Ratio of scatter and errors beyond which the errors are not those of these pixels. It was 0.4 to
+1.2 in the real frames at hand."""
+
+_SMOOTHED = 15
+"""Side of the squares, pixels, whose mean light tells which parts of a frame are dark."""
+
+_STARLIT = 4.0
+"""Standard deviations of these means above their median from which a part is not dark."""
+
+_DARKEST = 0.25
+"""Least share of the far pixels that is taken as dark, in a field that is full of sources."""
+
+_NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
+
+
+def calibrated_errors(
+    data: Image,
+    error: Image,
+    valid: NDArray[np.bool_],
+    center: Image,
+    pixelscale: tuple[float, float],
+    name: str = "frames",
+    *,
+    out: Image | None = None,
+) -> tuple[Image, tuple[float, ...]]:
+    """Correct the part of the errors that does not depend on the light.
+
+    Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star and
+    where the frame is dark, see `dark_pixels`. The
+    robust scatter of these differences over what the errors predict is the factor f by which the
+    errors there are wrong. Let b be the median of these errors: (f^2 - 1) b^2 is added to the
+    variance of every pixel, which leaves the photon noise of the star as it is.
+
+    Parameters
+    ----------
+    data, error : ndarray, (frames, ny, nx)
+        Frames and their standard deviations, in the same unit.
+    valid : ndarray of bool, (frames, ny, nx)
+    center : ndarray, (frames, 2)
+        x, y of the star, 0-indexed pixels.
+    pixelscale : tuple of float
+        x, y, arcsec per pixel.
+    name : str
+        For the log.
+    out : ndarray, (frames, ny, nx), optional
+        For the new errors, in place of a new array; may be `error`.
+
+    Returns
+    -------
+    errors : ndarray, (frames, ny, nx)
+        New standard deviations. Frames with fewer than 2000 usable pixels that far from the star
+        keep theirs.
+    ratios : tuple of float
+        f of every frame; NaN where there are too few pixels.
+
+    Notes
+    -----
+    Noise that neighbouring pixels share, such as 1/f noise, cancels in the differences and is not
+    counted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> noise = np.random.default_rng(1).normal(0.0, 0.5, (1, 300, 300))
+    >>> ones = np.ones_like(noise)
+    >>> center = np.array([[150, 150]])
+    >>> error, (ratio,) = calibrated_errors(noise, ones, ones > 0, center, (0.063, 0.063))
+    >>> bool(abs(error.mean() - 0.5) < 0.01), bool(abs(ratio - 0.5) < 0.01)
+    (True, True)
+    """
+    corrected, ratios = error.copy() if out is None else out, []
+    for k, (ratio, floor) in enumerate(_measured(data, error, valid, center, pixelscale)):
+        ratios.append(ratio)
+        if not ratio > 0:
+            continue
+        sigma = error[k].astype(float)
+        least = min(ratio, 1.0) * sigma
+        variance = np.maximum(sigma**2 + (ratio**2 - 1) * floor**2, least**2)
+        corrected[k] = np.where(valid[k], np.sqrt(variance), sigma)
+        _log.info("%s, frame %d: the noise far from the star is %.2f of ERR", name, k, ratio)
+    return corrected, tuple(ratios)
+
+
+def weighted_mean(
+    data: Image,
+    error: Image,
+    valid: NDArray[np.bool_],
+    which: Iterable[int] | None = None,
+) -> tuple[Image, Image, NDArray[np.bool_]]:
+    """Mean of frames, (frames, ny, nx), each weighted by its inverse median variance.
+
+    The errors of single pixels are no weights: they come from the counts of the pixels, so that
+    low counts would weigh more, and the mean would be too low. `which` are the indices of the
+    frames, by default of all.
+
+    Returns
+    -------
+    mean, error : ndarray, (ny, nx)
+        0 and 1 where no frame is valid.
+    valid : ndarray of bool, (ny, nx)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> counts = np.random.default_rng(1).poisson(5.0, (400, 10, 10)).astype(float)
+    >>> error = np.sqrt(np.maximum(counts, 1.0))
+    >>> mean, deviation, _ = weighted_mean(counts, error, counts >= 0)
+    >>> bool(abs((mean - 5.0).mean()) < 0.3 * deviation.mean())
+    True
+    """
+    light, noise, total = np.zeros((3, *data.shape[1:]))
+    # Frame by frame, which takes no memory.
+    for k in range(len(data)) if which is None else which:
+        frame, usable = data[k], valid[k]
+        variance = error[k].astype(float) ** 2
+        weight = 1 / np.median(variance[usable]) if usable.any() else 1.0
+        # Masked pixels may have any value if the data were replaced, also NaN.
+        light += np.where(usable, weight * frame, 0.0)
+        noise += np.where(usable, weight**2 * variance, 0.0)
+        total += weight * usable
+    covered = total > 0
+    safe = np.where(covered, total, 1.0)
+    return light / safe, np.where(covered, np.sqrt(noise) / safe, 1.0), covered
+
+
+def dark_pixels(frame: Image, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find the pixels of a frame that show noise, and no other stars, galaxies or nebulae.
+
+    The light is averaged over squares of 15 pixels, so that the noise of a pixel does not decide
+    whether it counts. Dark is what is at most four standard deviations above the median of these
+    means, or the darkest quarter of a field that is full of sources.
+
+    Parameters
+    ----------
+    frame : ndarray, (ny, nx)
+    usable : ndarray of bool, (ny, nx)
+        Pixels that may be chosen.
+
+    Returns
+    -------
+    ndarray of bool, (ny, nx)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frame = np.random.default_rng(1).normal(size=(60, 60))
+    >>> frame[:, :10] += 5.0
+    >>> dark = dark_pixels(frame, np.ones((60, 60), dtype=bool))
+    >>> bool(dark[:, :10].any()), bool(dark[:, 20:].mean() > 0.98)
+    (False, True)
+    """
+    if not usable.any():
+        return usable
+    # A single bright pixel is an outlier, and no source.
+    median = np.median(frame[usable])
+    limit = 5 * median_abs_deviation(frame[usable], scale="normal")
+    clipped = np.where(usable, np.clip(frame - median, -limit, limit), 0.0)
+    weight = uniform_filter(usable.astype(float), _SMOOTHED, mode="constant")
+    smooth = uniform_filter(clipped, _SMOOTHED, mode="constant") / np.maximum(weight, 1e-3)
+    values = smooth[usable]
+    middle = float(np.median(values))
+    below = middle - values[values <= middle]
+    # The scatter of the darker half, which sources do not reach.
+    spread = float(np.median(below)) / 0.6745
+    threshold = max(middle + _STARLIT * spread, float(np.quantile(values, _DARKEST)))
+    return usable & (smooth <= threshold)
+
+
+def why_odd_noise(ratios: Iterable[float]) -> str:
+    """Why errors cannot be those of the pixels; empty if they can.
+
+    Parameters
+    ----------
+    ratios : iterable of float
+        See `calibrated_errors`.
+    """
+    low, high = _PLAUSIBLE
+    for ratio in ratios:
+        if np.isfinite(ratio) and not low < ratio < high:
+            return (
+                f"far from the star, where the frame is darkest, its pixels scatter {ratio:.2g} "
+                f"times as much as ERR says, expected {low:g} to {high:g} times. ERR is probably "
+                "in another unit than SCI, a variance, or of other frames; or SCI was multiplied "
+                "by a factor; or a crowded field or a nebula leaves no dark part of the frame"
+            )
+    return ""
+
+
+def _measured(
+    data: Image,
+    error: Image,
+    valid: NDArray[np.bool_],
+    center: Image,
+    pixelscale: tuple[float, float],
+) -> Iterator[tuple[float, float]]:
+    """Ratio and median of the errors far from the star, for every frame; NaN if not known."""
+    y, x = np.indices(data.shape[1:])
+    for k, (frame, sigma, usable) in enumerate(zip(data, error, valid, strict=True)):
+        frame, sigma = frame.astype(float), sigma.astype(float)
+        away = np.hypot((x - center[k, 0]) * pixelscale[0], (y - center[k, 1]) * pixelscale[1])
+        # A pixel is compared only where all of its neighbours are usable.
+        complete = convolve(usable.astype(float), _NEIGHBOURS, mode="constant") > 0.99
+        far = dark_pixels(frame, usable & complete & (away > _FAR))
+        if far.sum() < _ENOUGH:
+            yield np.nan, np.nan
+            continue
+        difference = frame - convolve(frame, _NEIGHBOURS, mode="nearest")
+        predicted = np.sqrt(sigma**2 + convolve(sigma**2, _NEIGHBOURS, mode="nearest") / 4)
+        ratio = float(median_abs_deviation((difference / predicted)[far], scale="normal"))
+        yield ratio, float(np.median(sigma[far]))

@@ -11,41 +11,416 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, fourier_shift, minimum_filter, uniform_filter
+from scipy.signal import fftconvolve
 
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
+    IncompatibleSetupError,
     NoValidPixelsError,
+    ShapeError,
     UnitError,
 )
+from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.files import read_image
 from pyklip_diffrender.io.headers import header_number, header_text, merged_header
-from pyklip_diffrender.io.units import native_float64
-from pyklip_diffrender.scene.archive_names import detector_of
-from pyklip_diffrender.scene.checked_frames import usable_pixels
-from pyklip_diffrender.scene.detector_pixels import (
-    SHIFTS,
-    first_pixel,
-    mask_place,
-    net_shifts,
-    on_detector,
-    recorded_shifts,
-    undo_shifts,
+from pyklip_diffrender.io.units import native_float64, require_finite
+from pyklip_diffrender.scene.exposure import (
+    bar_place,
+    beginning,
+    detector_of,
+    image_mask,
+    middle,
+    module_of,
+    position_angle,
 )
-from pyklip_diffrender.scene.exposure import beginning, middle, position_angle
-from pyklip_diffrender.scene.integrations import Judgement, compressed, empty_integrations
+from pyklip_diffrender.scene.integrations import (
+    Judgement,
+    compressed,
+    empty_integrations,
+    usable_pixels,
+)
 from pyklip_diffrender.scene.star_place import measured_offset
-
-_log = logging.getLogger(__name__)
 
 __all__ = [
     "BAD_PIXEL_BITS",
     "BEHIND_THE_MASK",
+    "SHIFTS",
     "dither",
+    "filled",
+    "first_pixel",
+    "mask_place",
+    "net_shifts",
+    "on_detector",
     "on_detector_pixels",
     "read_calints",
+    "recorded_shifts",
+    "shift_frames",
+    "shift_variances",
+    "undo_shifts",
     "without_empty",
 ]
+
+
+# Undo the shifts of aligned frames, so that their pixels are those of the detector.
+#
+# A flat-field error belongs to a pixel of the detector. spaceKLIP's alignment moves frames by
+# fractions of a pixel, by a Fourier shift, after which a pixel of the array is a mixture of pixels
+# of the detector, a different one in every frame. The shift is recorded and can be undone.
+
+_log = logging.getLogger(__name__)
+
+SHIFTS = ("IMSHIFTS", "CENTER_SHIFT", "ALIGN_SHIFT")
+"""Extensions in which spaceKLIP records shifts: the first until release 2.1, the others since."""
+
+_AT_CENTER = 0.01
+"""Pixels within which a star is where a shift moves it."""
+
+_PAD = 5
+"""Rows and columns that are mirrored at every edge before a shift, as many as in the alignment."""
+
+_SIDE = 2048
+"""Rows and columns of a detector."""
+
+_NEAR = 50.0
+"""Pixels from the mask to a star, beyond which header and mask contradict each other: the start of
+another subarray is hundreds of pixels away."""
+
+_OVERHANG = 5
+"""Pixels by which a shift may move an array over the edge of the detector."""
+
+_REACH = 4
+"""Pixels about a gap from which it is filled."""
+
+_RESOLUTION = 1.1
+"""Standard deviation of the Gaussian autocorrelation of images in filled gaps, pixels: that of a
+point source at 4 microns."""
+
+_NUGGET = 1e-3
+"""Noise of the pixels relative to the image's variance, which keeps the equations regular."""
+
+_BESIDE = 2.3
+"""Pixels from a gap within which others are predicted, to see how good that is."""
+
+_DOUBT = 0.25
+"""Variance that what was filled in may add, relative to that of the pixel."""
+
+_PART = 0.1
+"""Squared weight of a gap above which a pixel is masked, however well it was filled."""
+
+
+def recorded_shifts(
+    hdus: fits.HDUList, center: NDArray[np.float64], shape: tuple[int, ...], name: str
+) -> NDArray[np.float64] | None:
+    """By how much spaceKLIP has shifted the frames of a file.
+
+    Since release 2.2, CENTER_SHIFT moves the star to the centre of the array, and ALIGN_SHIFT
+    aligns the frames with each other. Both are recorded before the frames are shifted.
+
+    Parameters
+    ----------
+    hdus : HDUList
+    center : ndarray, (2,)
+        x, y of the star in the first frame, 0-indexed.
+    shape : tuple of int
+        Number of frames, rows and columns.
+    name : str
+        The file's, for messages.
+
+    Returns
+    -------
+    ndarray, (frames, 2), or None
+        x, y, pixels; None if the frames were not shifted.
+
+    Raises
+    ------
+    ShapeError, NonFiniteError
+        If there are not two finite numbers for every frame.
+    """
+    shifts = {}
+    for key in SHIFTS:
+        if key in hdus:
+            data = hdus[key].data
+            if np.shape(data) != (shape[0], 2):
+                raise ShapeError(
+                    f"{name}: {key}: got shape {np.shape(data)}, expected ({shape[0]}, 2), "
+                    "x and y for every frame"
+                )
+            shifts[key] = native_float64(data)
+            require_finite(shifts[key], f"{name}: {key}")
+    if not shifts or "IMSHIFTS" in shifts:
+        return shifts.get("IMSHIFTS")
+    if "CENTER_SHIFT" in shifts:
+        middle = (np.array(shape[:0:-1]) - 1) / 2
+        if (np.abs(center + shifts["CENTER_SHIFT"][0] - middle) < _AT_CENTER).all():
+            return None  # The star is still where the shift starts.
+    return np.asarray(sum(shifts.values()))
+
+
+def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
+    """Where the centre of a coronagraph's mask is imaged on the whole detector.
+
+    Parameters
+    ----------
+    header : Header
+        DETECTOR, FILTER, and the mask in CORONMSK, APERNAME or SUBARRAY.
+    name : str
+        The file's, for messages.
+
+    Returns
+    -------
+    ndarray, (2,), or None
+        x, y, pixels from 0; None if the header does not say, or where it was not measured, as in
+        module B.
+    """
+    detector, mask = detector_of(header, name), image_mask(header, name)
+    if detector is None or mask is None or module_of(header, name) == "B":
+        return None
+    try:
+        passband = header_text(header, "FILTER", name) or ""
+        place = detector_place(mask, passband, bar_place(header, name))
+        if place.header_detector != detector:
+            return None
+        return np.add(place.center, filter_shift(passband))
+    except IncompatibleSetupError:
+        return None
+
+
+def net_shifts(
+    shifts: NDArray[np.float64], star: NDArray[np.float64], mask: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """How far the light of every frame is from the pixels that it fell on.
+
+    A file records by how much its frames were shifted, but not by how many whole pixels they were
+    cut or padded afterwards, all alike. Those follow from the position of the star, which was
+    within half a pixel of the centre of the mask.
+
+    Parameters
+    ----------
+    shifts : ndarray, (frames, 2)
+        x, y, see `recorded_shifts`.
+    star : ndarray, (frames, 2)
+        x, y of the star in the array.
+    mask : ndarray, (2,), or None
+        x, y of the mask on the detector, see `mask_place`.
+
+    Returns
+    -------
+    ndarray, (frames, 2)
+        x, y, pixels from the detector's. Without a mask, whole pixels are left out.
+    """
+    if mask is None:
+        return np.asarray(shifts - np.round(shifts.mean(axis=0)))
+    return np.asarray(shifts + np.round(np.median(star - mask - shifts, axis=0)))
+
+
+def first_pixel(
+    header: fits.Header, star: NDArray[np.float64], shape: tuple[int, ...], name: str
+) -> tuple[int, int] | None:
+    """Detector column and row of the first pixel of an array that was not moved.
+
+    Parameters
+    ----------
+    header : Header
+        SUBSTRT1 and SUBSTRT2 are the first column and row of the subarray, 1-indexed.
+    star : ndarray, (2,)
+        x, y of the star in the array, 0-indexed.
+    shape : tuple of int
+        Rows and columns of the array.
+    name : str
+        The file's, for messages.
+
+    Returns
+    -------
+    tuple of int or None
+        0-indexed. None if the header does not say, or says what cannot be: an array off the
+        detector, or a star away from the mask. The pattern of the flat field may show the place.
+    """
+    start = [header_number(header, key, name) for key in ("SUBSTRT1", "SUBSTRT2")]
+    if None in start:
+        return None
+    column, row = (int(each or 0) - 1 for each in start)
+    mask = mask_place(header, name)
+    if header_text(header, "SUBARRAY", name) is None:
+        mask = None  # Of a subarray that is not named, the beginning may be anywhere.
+    away = 0.0 if mask is None else float(np.abs(np.add(star, (column, row)) - mask).max())
+    if away > _NEAR or not on_detector((column, row), shape):
+        _log.warning(
+            "%s: with SUBSTRT1 and SUBSTRT2 of %d and %d the star at (%.1f, %.1f) is not where the "
+            "mask is on the detector; the place of the frames is not known",
+            name, column + 1, row + 1, *star,
+        )  # fmt: skip
+        return None
+    return column, row
+
+
+def on_detector(first: tuple[int, int], shape: tuple[int, ...]) -> bool:
+    """Whether an array is on the detector, up to a few pixels by which it may have been moved."""
+    ends = np.add(first, shape[::-1])
+    return bool(min(first) >= -_OVERHANG and ends.max() <= _SIDE + _OVERHANG)
+
+
+def undo_shifts(
+    data: NDArray[np.float64], error: NDArray[np.float64], shifts: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Shift frames that have gaps, without spreading the gaps.
+
+    A Fourier shift makes every pixel depend on all pixels of its row and column. Gaps are filled
+    from their neighbours before it; how wrong that may be is added to the variance of the pixels
+    that depend on it, and pixels where it would be more than a quarter of the variance are masked.
+
+    Parameters
+    ----------
+    data, error : ndarray, (frames, ny, nx)
+        Frames and standard deviations. Gaps are not finite; errors of 0 or less are gaps, too.
+    shifts : ndarray, (frames, 2)
+        x, y in pixels, less than one.
+
+    Returns
+    -------
+    data, error : ndarray, (frames, ny, nx)
+    valid : ndarray of bool, (frames, ny, nx)
+        False where a gap is, or matters.
+    """
+    missing = ~np.isfinite(data)
+    unknown = ~(np.isfinite(error) & (error > 0))
+    pairs = [filled(frame, gap) for frame, gap in zip(data, missing, strict=True)]
+    moved = shift_frames(np.stack([frame for frame, _ in pairs]), shifts)
+    leaked = _spread(np.stack([each for _, each in pairs]) ** 2, shifts)
+    del pairs  # They are as large as the frames.
+    gaps = _spread((missing | unknown).astype(float), shifts)
+    variance = shift_variances(error, ~unknown, shifts)
+    valid = (leaked < _DOUBT * variance) & (gaps < _PART)
+    return moved, np.sqrt(variance + leaked), valid
+
+
+def shift_variances(
+    error: NDArray[np.float64], known: NDArray[np.bool_], shifts: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Variances of shifted frames, from standard deviations before the shift.
+
+    Variances ring where a pixel has a much larger one than its neighbours; they are not allowed
+    below the smallest of the pixels around.
+
+    Parameters
+    ----------
+    error : ndarray, (frames, ny, nx)
+        Any value where not `known`.
+    known : ndarray of bool, (frames, ny, nx)
+    shifts : ndarray, (frames, 2)
+        x, y in pixels.
+
+    Returns
+    -------
+    ndarray, (frames, ny, nx)
+    """
+    variance = np.empty_like(error)
+    for k, (sigma, good) in enumerate(zip(error, known, strict=True)):
+        variance[k] = 1.0 if not good.any() else _nearest(np.where(good, sigma, 1.0) ** 2, ~good)
+    least = np.stack([minimum_filter(each, 3, mode="nearest") for each in variance])
+    return np.maximum(shift_frames(variance, shifts), least)
+
+
+def filled(
+    frame: NDArray[np.float64], gaps: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fill the gaps of an image from their neighbours.
+
+    The estimate is the best linear one for a random image with the resolution of the telescope
+    (kriging); how well it predicts the neighbours of a gap from the others says how good it is.
+
+    Parameters
+    ----------
+    frame : ndarray, (ny, nx)
+    gaps : ndarray of bool, (ny, nx)
+
+    Returns
+    -------
+    image, doubt : ndarray, (ny, nx)
+        Without gaps; and the standard deviation of what was filled in, 0 elsewhere.
+    """
+    doubt = np.zeros_like(frame)
+    if not gaps.any() or gaps.all():
+        return np.where(gaps, 0.0, frame), doubt
+    image = _nearest(frame, gaps)
+    rough = image - uniform_filter(image, 3, mode="nearest")
+    typical = np.sqrt(uniform_filter(rough**2, 5, mode="nearest") * 25 / 16)
+    doubt[gaps] = typical[gaps]
+    for row, column in np.argwhere(gaps):
+        window = np.s_[
+            max(row - _REACH, 0) : row + _REACH + 1, max(column - _REACH, 0) : column + _REACH + 1
+        ]
+        y, x = np.nonzero(~gaps[window])
+        y, x = y + window[0].start - row, x + window[1].start - column
+        near = np.hypot(x, y) < _REACH + 0.5
+        y, x = y[near], x[near]
+        # On all sides; what lies beyond the edge of a large gap is not interpolated.
+        if min(x.max(initial=-9), y.max(initial=-9), -x.min(initial=9), -y.min(initial=9)) < 1:
+            continue
+        values = frame[y + row, x + column]
+        distances = np.hypot(x - x[:, None], y - y[:, None])
+        inverse = np.linalg.inv(_covariance(distances) + _NUGGET * np.eye(len(x)))
+        mean = values.mean()
+        excess = inverse @ (values - mean)
+        image[row, column] = mean + _covariance(np.hypot(x, y)) @ excess
+        left_out = (excess / np.diag(inverse))[np.hypot(x, y) < _BESIDE]
+        doubt[row, column] = (
+            np.sqrt((left_out**2).mean()) if len(left_out) else typical[row, column]
+        )
+    return image, doubt
+
+
+def _covariance(distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.exp(-0.5 * (distance / _RESOLUTION) ** 2))
+
+
+def _nearest(image: NDArray[np.float64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Replace gaps by the nearest other pixel."""
+    if not gaps.any():
+        return image
+    places = distance_transform_edt(gaps, return_distances=False, return_indices=True)
+    return np.asarray(image[tuple(places)])
+
+
+def _spread(squares: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Variances after a shift of pixels that are independent of each other."""
+    result = np.zeros_like(squares)
+    for k, (variance, shift) in enumerate(zip(squares, shifts, strict=True)):
+        if not variance.any():
+            continue
+        kernel = np.zeros_like(variance)
+        # Where `fftconvolve` has the origin of a kernel.
+        kernel[(kernel.shape[0] - 1) // 2, (kernel.shape[1] - 1) // 2] = 1.0
+        kernel = np.fft.ifft2(fourier_shift(np.fft.fft2(kernel), shift[::-1])).real ** 2
+        result[k] = np.maximum(fftconvolve(variance, kernel, mode="same"), 0.0)
+    return result
+
+
+def shift_frames(frames: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shift frames by fractions of a pixel with the Fourier transform.
+
+    Parameters
+    ----------
+    frames : ndarray, (frames, ny, nx)
+        Without NaN.
+    shifts : ndarray, (frames, 2)
+        x, y in pixels.
+
+    Returns
+    -------
+    ndarray, (frames, ny, nx)
+    """
+    inner = slice(_PAD, -_PAD)
+    shifted = np.empty_like(frames)
+    for k, (frame, (x, y)) in enumerate(zip(frames, shifts, strict=True)):
+        padded = np.pad(frame, _PAD, mode="reflect")
+        moved = np.fft.ifft2(fourier_shift(np.fft.fft2(padded), (y, x))).real
+        shifted[k] = moved[inner, inner]
+    return shifted
+
+
+# Read JWST stage-2 coronagraphic files, as the pipeline or spaceKLIP write them.
 
 BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
 """JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,

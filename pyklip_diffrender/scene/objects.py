@@ -12,8 +12,14 @@ from typing import Any
 
 from astropy import units as u
 
-from pyklip_diffrender.io.geometry import full_circle
-from pyklip_diffrender.io.units import ARCSEC, set_numbers, to_arcsec, to_number, to_pair
+from pyklip_diffrender.io.units import (
+    ARCSEC,
+    full_circle,
+    set_numbers,
+    to_arcsec,
+    to_number,
+    to_pair,
+)
 
 __all__ = [
     "ALPHA_PICTORIS_W2",

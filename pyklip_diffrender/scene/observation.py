@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,22 +16,239 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
-from pyklip_diffrender.io.geometry import full_circle, half_circle, rotation_matrix
+from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.scene.catalogue_star import star_of
-from pyklip_diffrender.scene.checked_frames import checked_frames, selected
-from pyklip_diffrender.scene.exposure import instrument_of
-from pyklip_diffrender.scene.file_frames import (
-    frames_in,
-    frames_of_file,
-    means_of_file,
-    means_of_pointings,
+from pyklip_diffrender.io.units import full_circle, half_circle, rotation_matrix
+from pyklip_diffrender.scene.exposure import instrument_of, star_of
+from pyklip_diffrender.scene.integrations import (
+    Judgement,
+    calibrated_errors,
+    checked_frames,
+    checked_stacks,
+    judge_pointings,
+    mask_unusable,
+    pointings,
+    selected,
+    weighted_mean,
 )
-from pyklip_diffrender.scene.integrations import pointings
-from pyklip_diffrender.scene.measured_noise import weighted_mean
-from pyklip_diffrender.scene.window import Window
+from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
 
-__all__ = ["Observation"]
+__all__ = [
+    "Observation",
+    "Window",
+    "frames_in",
+    "frames_of_file",
+    "means_of_file",
+    "means_of_pointings",
+]
+
+
+# Boxes of pixels about the star: cutting them out of frames and putting them back.
+
+
+@dataclass(frozen=True)
+class Window:
+    """A box in frames that have their star in one place; it may reach beyond their edges.
+
+    Attributes
+    ----------
+    y, x : int
+        The box's first row and column in the frame.
+    shape : tuple of int
+        (ny, nx) of the box.
+    """
+
+    y: int
+    x: int
+    shape: tuple[int, int]
+
+    @classmethod
+    def about(cls, center: NDArray[np.float64], shape: tuple[int, int]) -> Window:
+        """Return the box whose middle is within half a pixel of `center`, [x, y]."""
+        ny, nx = shape
+        return cls(round(center[1] - (ny - 1) / 2), round(center[0] - (nx - 1) / 2), shape)
+
+    @classmethod
+    def holding(cls, valid: NDArray[np.bool_]) -> Window:
+        """Return the smallest box that holds all valid pixels of frames, (n, ny, nx)."""
+        _, rows, columns = np.nonzero(valid)
+        shape = (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)
+        return cls(int(rows.min()), int(columns.min()), shape)
+
+    def __contains__(self, other: Window) -> bool:
+        (ny, nx), (other_ny, other_nx) = self.shape, other.shape
+        return (
+            self.y <= other.y
+            and self.x <= other.x
+            and self.y + ny >= other.y + other_ny
+            and self.x + nx >= other.x + other_nx
+        )
+
+    def _overlap(self, frame: tuple[int, ...]) -> tuple[Any, Any]:
+        """Return the slices of the overlap of box and frame, in the frame and in the box."""
+        y0, x0 = max(self.y, 0), max(self.x, 0)
+        y1 = max(min(self.y + self.shape[0], frame[0]), y0)
+        x1 = max(min(self.x + self.shape[1], frame[1]), x0)
+        return np.s_[..., y0:y1, x0:x1], np.s_[
+            ..., y0 - self.y : y1 - self.y, x0 - self.x : x1 - self.x
+        ]
+
+    def cut(self, cube: NDArray[Any], fill: Any) -> NDArray[Any]:
+        """Cut the box out of (n, Ny, Nx): (n, ny, nx), with `fill` outside the frame."""
+        boxes = np.full((len(cube), *self.shape), fill, dtype=cube.dtype)
+        in_frame, in_box = self._overlap(cube.shape[1:])
+        boxes[in_box] = cube[in_frame]
+        return boxes
+
+    def paste(self, box: NDArray[np.float64], frame: tuple[int, int]) -> NDArray[np.float64]:
+        """Put a box (ny, nx) back into a frame (Ny, Nx) of NaN."""
+        out = np.full(frame, np.nan)
+        in_frame, in_box = self._overlap(frame)
+        out[in_frame] = box[in_box]
+        return out
+
+
+# The frames of a file, without the integrations and pixels that cannot be used.
+
+_log = logging.getLogger(__name__)
+
+
+def frames_of_file(
+    path: str | os.PathLike[str],
+    *,
+    every_integration: bool,
+    star: tuple[float, float] | None = None,
+) -> dict[str, Any]:
+    """Read and judge a calints file: the attributes of `Observation.from_fits`."""
+    with open_fits(path, images=False) as hdus:
+        return frames_in(hdus, path, every_integration=every_integration, star=star)
+
+
+def frames_in(
+    hdus: fits.HDUList,
+    path: str | os.PathLike[str],
+    *,
+    every_integration: bool,
+    star: tuple[float, float] | None = None,
+) -> dict[str, Any]:
+    """Read and judge the calints file at that path, which is open, see `frames_of_file`."""
+    frames, kept, original = _judged(hdus, path, compact=False, star=star)
+    if not every_integration:
+        return frames if kept.all() else frames | selected(frames, np.flatnonzero(kept))
+    # Frames of empty integrations have the pixels of the one before, and none is valid.
+    frames |= selected(frames, np.maximum(np.cumsum(original) - 1, 0))
+    every = original.copy()
+    every[original] = kept
+    mask_unusable(frames, np.broadcast_to(every[:, None, None], frames["valid"].shape))
+    return frames
+
+
+def means_of_file(
+    path: str | os.PathLike[str], *, star: tuple[float, float] | None = None
+) -> dict[str, Any]:
+    """Read and judge a calints file, and average the integrations of each of its pointings.
+
+    It takes at most as much memory as the file has, however many integrations there are; see
+    `Observation.means_from_fits`.
+
+    Returns
+    -------
+    dict
+        The attributes of the observation.
+    """
+    with open_fits(path, images=False) as hdus:
+        frames, kept, _ = _judged(hdus, path, compact=True, star=star)
+    return frames | means_of_pointings(frames, np.flatnonzero(kept))
+
+
+def means_of_pointings(frames: Mapping[str, Any], which: NDArray[np.intp]) -> dict[str, Any]:
+    """Average the integrations of each pointing.
+
+    Parameters
+    ----------
+    frames : mapping
+        The attributes of an `Observation` of single integrations.
+    which : ndarray of int
+        Indices of the integrations that are used, at least one.
+
+    Returns
+    -------
+    dict
+        The attributes that change.
+    """
+    center, angles = frames["center"], frames["position_angles"]
+    turns = None if angles is None else angles[which]
+    groups = [which[group] for group in pointings(center[which], turns)]
+    shape = (len(groups), *frames["data"].shape[1:])
+    data, error, valid = np.empty(shape), np.empty(shape), np.empty(shape, dtype=bool)
+    for k, group in enumerate(groups):
+        data[k], error[k], valid[k] = weighted_mean(
+            frames["data"], frames["error"], frames["valid"], group
+        )
+    ratios = frames.get("noise_ratios", ())
+    return {
+        "data": data,
+        "error": error,
+        "valid": valid,
+        "center": np.stack([center[group].mean(axis=0) for group in groups]),
+        "position_angles": None if angles is None else angles[[group[0] for group in groups]],
+        "noise_ratios": tuple(_oddest([ratios[j] for j in g]) for g in groups) if ratios else (),
+        "integrations": tuple(len(group) for group in groups),
+    }
+
+
+def _oddest(ratios: list[float]) -> float:
+    """The ratio that is farthest from 1, by a factor; NaN if none is known."""
+    known = [each for each in ratios if each > 0]
+    return max(known, key=lambda each: abs(np.log(each)), default=np.nan)
+
+
+def _judged(
+    hdus: fits.HDUList,
+    path: str | os.PathLike[str],
+    *,
+    compact: bool,
+    star: tuple[float, float] | None,
+) -> tuple[dict[str, Any], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Read and judge an open file, in place, so that its integrations are in memory once.
+
+    The attributes of the observation; which of its integrations are kept, (frames,), and which of
+    the file's are not empty, (integrations,).
+    """
+    arguments, shifts = read_calints(hdus, path, compact=compact, star=star)
+    arguments, shifts, empty = without_empty(arguments, shifts)
+    frames = checked_stacks(**arguments)
+    name = frames["name"]
+    if shifts is not None:
+        frames |= on_detector_pixels(arguments, frames["center"], shifts, is_measured=star is None)
+    mask_unusable(frames)
+    if instrument_of(frames["header"], name) == "NIRCAM":
+        frames["error"], frames["noise_ratios"] = calibrated_errors(
+            frames["data"], frames["error"], frames["valid"], frames["center"],
+            frames["pixelscale"], name, out=frames["error"],
+        )  # fmt: skip
+    original = np.ones(len(frames["data"]), dtype=bool) if empty is None else empty.kept
+    judgement = _judgement(frames, original)
+    frames["remarks"] = (*(() if empty is None else empty.remarks), *judgement.remarks)
+    if not judgement.kept.any():
+        raise NoValidPixelsError(f"{name}: no integration is left: {'; '.join(judgement.remarks)}")
+    mask_unusable(frames)
+    return frames, judgement.kept, original
+
+
+def _judgement(frames: dict[str, Any], original: NDArray[np.bool_]) -> Judgement:
+    """Compare the integrations that are left of a file with each other."""
+    names = [f"integration {k + 1} of {len(original)}" for k in np.flatnonzero(original)]
+    judgement = judge_pointings(
+        frames["data"], frames["error"], frames["valid"], frames["center"],
+        frames["position_angles"], frames["pixelscale"], names,
+    )  # fmt: skip
+    for remark in judgement.remarks:
+        _log.warning("%s: %s", frames["name"], remark)
+    return judgement
+
+
+# Observed frames: pixel values, errors, masks, and the position of the star.
 
 
 @dataclass(frozen=True)
@@ -175,7 +393,7 @@ class Observation:
         of aligned frames (IMSHIFTS, or CENTER_SHIFT and ALIGN_SHIFT): they are undone, so that the
         pixels are those of the detector, whose flat-field errors then stay in their pixels.
         Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
-        `pyklip_diffrender.scene.measured_noise.calibrated_errors`. Integrations that are empty are
+        `pyklip_diffrender.scene.integrations.calibrated_errors`. Integrations that are empty are
         left out, and three or more are compared with each other, see
         ``scene.integrations.judge_integrations``; `remarks` says what was left out.
 

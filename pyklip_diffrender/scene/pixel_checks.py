@@ -17,9 +17,9 @@ from scipy.ndimage import convolve, gaussian_filter, map_coordinates, shift, uni
 from scipy.stats import median_abs_deviation
 
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.scene.measured_noise import dark_pixels
+from pyklip_diffrender.scene.integrations import dark_pixels
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symmetry, stamp_about
 from pyklip_diffrender.wavefront.opd import random_opd
 

@@ -13,8 +13,7 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
-from pyklip_diffrender.io.headers import fits_text
-from pyklip_diffrender.io.keywords import set_keyword
+from pyklip_diffrender.io.headers import fits_text, set_keyword
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["ccd_data", "primary_hdu", "world_coordinates"]

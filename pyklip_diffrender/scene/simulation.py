@@ -1,18 +1,207 @@
-"""Simulated observations: the model's image of a scene, with shot and read noise."""
+"""The model of an observed frame, and simulated observations."""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.instrument.masks import MASKS, detector_place, stop_is_measured
+from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
+from pyklip_diffrender.instrument.spectrum import filter_throughput
+from pyklip_diffrender.io.headers import header_text
+from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask, module_of
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["expected_photons", "planet_photons", "simulate", "star_photons"]
+__all__ = [
+    "coarse_arguments",
+    "expected_photons",
+    "faintness",
+    "model_for",
+    "planet_photons",
+    "simulate",
+    "star_photons",
+]
+
+
+# The model for a real frame.
+
+Items = tuple[tuple[str, Any], ...]
+
+_NPIX = 256
+"""Samples across the pupil. The error of so coarse a grid, 2 % of the image, is static, and the
+fit absorbs it: with 256 and 512 samples the residual of real frames was the same."""
+
+_CELLS = 1.2
+"""Cells of the occulter per lambda/D. The round masks have no structure finer than several
+lambda/D, so that this changes images by 3e-7 of their peak or less, and one cell per pixel is
+enough in all filters of both channels; two cells per pixel take four times as long."""
+
+
+_RING = (5.0, 16.0)
+_REFERENCE = 1800.0
+"""Median of the squared S/N of pixels at these distances from the star, pixels, in one roll of
+G 7-34 in F444W, for which `benchmarks.scene_fidelity` measured what a coarser model costs."""
+
+_VERY_FAINT = 100.0
+
+
+def faintness(observation: Observation) -> float:
+    """By what factor a star is fainter, compared with its noise, than G 7-34 in one roll."""
+    frame = observation.combined()
+    y, x = np.indices(frame.shape)
+    column, row = frame.center[0]
+    away = np.hypot(x - column, y - row)
+    ring = frame.valid[0] & (away > _RING[0]) & (away < _RING[1])
+    if not ring.any():
+        return 1.0
+    squares = (frame.data[0][ring] / frame.error[0][ring]) ** 2
+    return _REFERENCE / max(float(np.median(squares)), 1e-6)
+
+
+def coarse_arguments(observation: Observation, size: int) -> dict[str, Any]:
+    """Arguments of `model_for` for a first look, by the noise of the frames.
+
+    Parameters
+    ----------
+    observation : Observation
+    size : int
+        Side of the pixels on which the model is evaluated.
+    """
+    nlambda = 3 if faintness(observation) >= _VERY_FAINT else 5
+    if observation.filter is None:
+        return {}
+    shortest = float(filter_throughput(observation.filter)[0][0])
+    npix = _NPIX // 2
+    while npix < samples_for_field(size * max(observation.pixelscale), shortest):
+        npix *= 2
+    return {"nlambda": nlambda, "npix": npix}
+
+
+def model_for(observation: Observation, size: int | None = None, **overrides: Any) -> OpticalSystem:
+    """Make the model of the coronagraph for an observation.
+
+    Frames whose header says NIRCam get the detector's scale and shear from the SIAF and the Lyot
+    stop where it is in flight, or where it should be if that was not measured (short wave, bars
+    and module B). This is where a fit starts. A model that was made before is used again.
+
+    Parameters
+    ----------
+    observation : Observation
+        The model has its filter, and as many pupil samples as its width asks for.
+    size : int, optional
+        Side of the detector in pixels, for an observation that will be cut out; default the shape
+        of the observation.
+    **overrides
+        Arguments of `nircam_coronagraph`, such as ``nlambda=5``.
+
+    Returns
+    -------
+    OpticalSystem
+
+    Raises
+    ------
+    ShapeError
+        If the frames are smaller than `size`.
+    IncompatibleSetupError
+        If the filter is not known, or the instrument or the coronagraph is not one that is
+        modelled.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> ones = np.ones((24, 24))
+    >>> frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
+    >>> model = dr.model_for(frame, monochromatic=4.5e-6, npix=128)
+    >>> tuple(model().shape)
+    (24, 24)
+    """
+    if size is not None and size > min(observation.shape):
+        ny, nx = observation.shape
+        raise ShapeError(
+            f"{observation.name}: {size} x {size} pixels do not fit into {nx} x {ny}. Choose a "
+            "smaller size (--size)"
+        )
+    if observation.filter is None:
+        raise IncompatibleSetupError(
+            f"{observation.name}: the filter of these frames is not known. Give the observation a "
+            "filter, such as 'F444W', or make the model with nircam_coronagraph"
+        )
+    instrument = header_text(observation.header, "INSTRUME", observation.name)
+    if instrument is not None and instrument.upper() != "NIRCAM":
+        raise IncompatibleSetupError(
+            f"{observation.name}: these frames are of {instrument}, and only NIRCam's coronagraph "
+            "is built in. Make the model of another one with from_poppy, and fit with refine"
+        )
+    arguments: dict[str, Any] = {
+        "fov_pixels": observation.shape if size is None else size,
+        "pixelscale": observation.pixelscale,
+    }
+    if observation.is_nircam:
+        mask_name = image_mask(observation.header, observation.name)
+        name = overrides.get("image_mask") or mask_name
+        if name is None:
+            raise IncompatibleSetupError(
+                f"{observation.name}: the header does not say behind which mask the star is. Add "
+                "CORONMSK, such as MASKA335R, or give image_mask"
+            )
+        if name not in MASKS:
+            raise IncompatibleSetupError(
+                f"{observation.name}: these frames have image mask {mask_name}, expected one of "
+                f"{', '.join(MASKS)}"
+            )
+        along = bar_place(observation.header, observation.name)
+        module = module_of(observation.header, observation.name) or "A"
+        place = detector_place(name, observation.filter, along, overrides.get("module", module))
+        detector = detector_of(observation.header, observation.name)
+        if detector not in (None, place.header_detector):
+            raise IncompatibleSetupError(
+                f"{observation.name}: these frames are of the detector {detector}, expected "
+                f"{place.header_detector}, on which {name} is imaged in {observation.filter}"
+            )
+        shortest = float(filter_throughput(observation.filter)[0][0])
+        (ny, nx), (x, y) = observation.shape, place.siaf_pixelscale
+        npix = _NPIX
+        while npix < samples_for_field(max(nx * x, ny * y, place.period()), shortest):
+            npix *= 2
+        arguments |= {
+            "image_mask": name,
+            "module": place.module,
+            "bar_place": place.place,
+            "pixelscale": place.siaf_pixelscale,
+            "shear": place.siaf_shear,
+            "nlambda": 7,
+            "npix": npix,
+            "occulter_sampling": _CELLS,
+            "defaults": FLIGHT_ALIGNMENT
+            if stop_is_measured(name, place.short_wave, place.module)
+            else None,
+        }
+    arguments |= overrides
+    defaults = arguments.pop("defaults", None)
+    items = tuple(sorted(arguments.items()))
+    try:
+        return _cached_model(observation.filter, items, tuple(sorted((defaults or {}).items())))
+    except TypeError:  # An argument that cannot be a key, such as a spectrum in arrays.
+        return _model(observation.filter, items, tuple((defaults or {}).items()))
+
+
+def _model(name: str, items: Items, defaults: Items) -> OpticalSystem:
+    return nircam_coronagraph(name, **dict(items), defaults=dict(defaults))
+
+
+_cached_model = lru_cache(maxsize=4)(_model)
+
+
+# Simulated observations: the model's image of a scene, with shot and read noise.
 
 
 def star_photons(model: OpticalSystem, scene: Scene, opd: Any) -> NDArray[np.float64]:

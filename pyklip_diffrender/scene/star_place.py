@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
-__all__ = ["center_of_pattern", "center_of_symmetry", "measured_offset", "stamp_about"]
+__all__ = [
+    "center_of_pattern",
+    "center_of_symmetry",
+    "local_maxima",
+    "measured_offset",
+    "stamp_about",
+]
 
 Image = NDArray[np.float64]
 
@@ -189,3 +198,29 @@ def measured_offset(
     if np.hypot(*(center_of_pattern(bright, about) - away)) * pixelscale > _AGREE:
         return None
     return np.asarray(np.round(center) + away - center)
+
+
+def local_maxima(
+    image: NDArray[np.float64], allowed: NDArray[np.bool_], threshold: float, *, size: int
+) -> list[tuple[int, int]]:
+    """Find pixels above a threshold that are the maximum of the square around them.
+
+    Parameters
+    ----------
+    image : ndarray, (ny, nx)
+        NaN where unknown.
+    allowed : ndarray of bool, (ny, nx)
+        Where maxima are accepted.
+    threshold : float
+    size : int
+        Side of the square, pixels.
+
+    Returns
+    -------
+    list of (row, column)
+        Highest first.
+    """
+    filled = np.where(np.isnan(image), -math.inf, image)
+    peaks = (filled == maximum_filter(filled, size=size)) & allowed & (filled > threshold)
+    places = np.argwhere(peaks)[np.argsort(-filled[peaks], kind="stable")]
+    return [(int(row), int(column)) for row, column in places]

@@ -23,20 +23,20 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.units import require_bound
-from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
-from pyklip_diffrender.pyklip_backend.source import JudgedFiles, OpenedFile, judged_before
+from pyklip_diffrender.pyklip_backend.dataset_frames import JudgedFiles, OpenedFile, judged_before
+from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.refinement import to_jansky
-from pyklip_diffrender.scene.frame_files import FrameFile
+from pyklip_diffrender.scene.admission import FrameFile
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.spaceklip.database_files import (
     complete_header,
+    source_table,
     write_contrast,
     write_database,
     write_mask,
     write_rolls,
     write_snr,
 )
-from pyklip_diffrender.spaceklip.sources import source_table
 
 __all__ = ["Database", "run_obs"]
 

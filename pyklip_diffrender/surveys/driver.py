@@ -18,18 +18,18 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import duration, heartbeat
 from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.surveys.config import Config, read_config
-from pyklip_diffrender.surveys.execution import in_this_process, with_dask
-from pyklip_diffrender.surveys.folders import (
+from pyklip_diffrender.surveys.execution import Work, in_this_process, with_dask
+from pyklip_diffrender.surveys.jobs import (
+    Job,
     Record,
     clean,
+    jobs_of,
     prepare,
     read_record,
     rename_to_jobs,
     staging,
 )
-from pyklip_diffrender.surveys.jobs import Job, jobs_of
-from pyklip_diffrender.surveys.runs import Work
-from pyklip_diffrender.surveys.tables import row, table_of, write_tables
+from pyklip_diffrender.surveys.survey_page import row, table_of, write_tables
 
 __all__ = ["run_survey", "survey"]
 
@@ -93,7 +93,7 @@ def survey(
     >>> import pyklip_diffrender as dr
     >>> table = dr.survey("survey.toml", "products")  # doctest: +SKIP
     """
-    from pyklip_diffrender.surveys.work import reduce_job
+    from pyklip_diffrender.surveys.execution import reduce_job
 
     limit = read_config(config).memory_limit
     work: Work = reduce_job

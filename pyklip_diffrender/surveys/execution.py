@@ -1,24 +1,244 @@
-"""Jobs run in this process, or by the workers of dask.distributed."""
+"""The work of a job, run in this process or by the workers of dask.distributed."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import math
+import os
+import shutil
+import socket
 import sys
 import time
-from collections import defaultdict, deque
-from collections.abc import Iterator, Sequence
+import traceback
+from collections import abc, defaultdict, deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
-from pyklip_diffrender.surveys.folders import Record, finished, read_record
-from pyklip_diffrender.surveys.jobs import Job
-from pyklip_diffrender.surveys.runs import Work, failure, run_job
+from pyklip_diffrender._version import __version__
+from pyklip_diffrender.detection import measured_planet, with_planets
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, RefinementError
+from pyklip_diffrender.io.files import sha256
+from pyklip_diffrender.reduction import ReduceOptions, Reduction, prepare, summarise, write_products
+from pyklip_diffrender.refinement import FrameFit, Refinement, nircam_settings
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.surveys.jobs import (
+    Injection,
+    Job,
+    Record,
+    encodable,
+    finished,
+    publish,
+    read_record,
+    staging,
+    write_record,
+)
 
-__all__ = ["in_this_process", "with_dask"]
+__all__ = ["Work", "failure", "in_this_process", "reduce_job", "run_job", "with_dask"]
+
+
+# The work of a job: a reduction, perhaps with an injected planet.
+
+
+def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
+    """Reduce a sequence, perhaps with a planet in it, and write the products."""
+    changes: dict[str, Any] = {"memory": memory}
+    if job.injection is not None and job.base_folder is not None:
+        fit = Refinement.read(folder.parent / job.base_folder / "fit.fits")
+        first = fit.frames[0].observation
+        planet = _planet(job.injection, first.position_angle)
+        frames: abc.Sequence[FrameFit] = [
+            each for each in fit.frames if not each.observation.reference
+        ]
+        references = tuple(each.observation for each in fit.frames if each.observation.reference)
+        if job.options.disk:
+            frames = _with_disk(frames, _sequence(job).cutout(job.options.size).science)
+        science = with_planets(frames, [planet])
+        sequence = Sequence(first.target, science, references)
+        changes |= {"systematics": fit.systematics or "off", "wide": False}
+    else:
+        sequence = _sequence(job)
+    options = _options(job, sequence.science[0], **changes)
+    reduction = prepare(sequence, job.opd, options).run()
+    write_products(reduction, folder, fit=job.injection is None)
+    result = _result(summarise(reduction))
+    if job.injection is not None and job.base is not None:
+        result["recovered"] = _recovered(reduction, job.injection, frames[0].flux)
+    return result
+
+
+def _sequence(job: Job) -> Sequence:
+    return Sequence.from_files(job.files, target=job.target, filter=job.filter, epoch=job.epoch)
+
+
+def _options(job: Job, frames: Observation, **changes: Any) -> ReduceOptions:
+    """Options of a job's reduction; settings that it does not name are those of the preset."""
+    keywords = {**job.options.keywords, **changes}
+    if job.options.settings:
+        keywords["settings"] = nircam_settings(frames, **job.options.settings)
+    return ReduceOptions(**keywords)
+
+
+def _with_disk(
+    frames: abc.Sequence[FrameFit], original: abc.Sequence[Observation]
+) -> list[FrameFit]:
+    """The frames of a fit, with the extended light that was subtracted from them."""
+    return [
+        replace(frame, observation=replace(frame.observation, data=each.combined().data))
+        for frame, each in zip(frames, original, strict=True)
+    ]
+
+
+def _planet(injection: Injection, north: float) -> Planet:
+    """Beside the star in the first frame, whose +y axis has the position angle `north`."""
+    return Planet(injection.contrast, injection.separation, injection.angle - north)
+
+
+def _recovered(reduction: Reduction, planet: Injection, flux: float) -> dict[str, Any]:
+    """Measure an injected planet: its candidate, or else the position of the injection.
+
+    Its contrast is relative to a star of that flux.
+    """
+    detection = reduction.detection
+    place = _planet(planet, detection.north).offset
+    measured = measured_planet(detection, place, flux)._asdict()
+    return {key: value if math.isfinite(value) else None for key, value in measured.items()}
+
+
+def _result(summary: dict[str, Any]) -> dict[str, Any]:
+    """Facts of a reduction for the tables and the page of a survey."""
+    keys = ("target", "filter", "sentence", "limits", "threshold_snr", "left_out")
+    search = summary["wide_field"] or summary
+    curve = search["contrast_curve"]
+    return {
+        **{key: summary[key] for key in keys},
+        "candidates": [{"false_alarm_probability": None, **each} for each in search["candidates"]],
+        "fit_status": summary["status"]["name"],
+        "reduced_chi2": summary["fit"]["reduced_chi2"],
+        "error_factor": summary["fit"]["error_factor"],
+        "frames": sum(each["use"] == "target" for each in summary["frames"]),
+        "curve": {key: curve[key] for key in ("sigmas", "separation_arcsec", "contrast")},
+    }
+
+
+# How a job is run, so that it ends in a folder whatever happens.
+
+Work = Callable[[Job, Path], dict[str, Any]]
+"""Computes a job, writes its products to a folder, and returns plain values for the record."""
+
+
+def run_job(job: Job, jobs: Path, work: Work) -> Record:
+    """Run a job and publish its folder; returns its record.
+
+    A job that is there already is not run again. No error of the job goes through: its record
+    says that it failed, and why.
+    """
+    final = jobs / job.folder
+    known = read_record(final)
+    if known is not None and known["status"] == "finished":
+        return known
+    began = time.perf_counter()
+    _reset_peak()
+    folder = None
+    try:
+        _require_same_world(job, jobs)
+        folder = staging(jobs, job.key)
+        result = work(job, folder)
+        record = {**_circumstances(began), "status": "finished", "result": result}
+        whole = write_record(folder, job, record)
+        publish(folder, final)
+    except Exception as error:
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        return failure(job, jobs, error, **_circumstances(began))
+    return whole
+
+
+def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) -> Record:
+    """Publish the record of a failed job, as far as the disk takes it, and return it."""
+    record: Record = {
+        **circumstances,
+        "status": "failed",
+        "message": encodable(f"{type(error).__name__}: {error}".removesuffix(": ")),
+        "traceback": encodable("".join(traceback.format_exception(error))),
+        "result": {},
+    }
+    folder = None
+    try:
+        folder = staging(jobs, job.key)
+        record = write_record(folder, job, record)
+        publish(folder, jobs / job.folder)
+    except OSError:
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+    return record
+
+
+def _require_same_world(job: Job, jobs: Path) -> None:
+    """Refuse to work where version, folders or files are not those of the plan."""
+    host = socket.gethostname()
+    if job.version != __version__:
+        raise IncompatibleSetupError(
+            f"the worker on {host} has pyklip_diffrender {__version__}, expected {job.version} as "
+            "where the survey was started. Install the same version on both"
+        )
+    if not jobs.is_dir():
+        raise CorruptFileError(
+            f"{jobs}: the worker on {host} does not see this folder. Put the output on a disk that "
+            "all workers share"
+        )
+    for name, digest in job.inputs.items():
+        if not Path(name).is_file():
+            raise CorruptFileError(
+                f"{name}: the worker on {host} does not see this file. Put the data on a disk that "
+                "all workers share, under the same path"
+            )
+        if sha256(name) != digest:
+            raise CorruptFileError(
+                f"{name}: the content on {host} is not that of the plan. Start the survey again if "
+                "the file was changed"
+            )
+
+
+def _circumstances(began: float) -> dict[str, Any]:
+    return {
+        "seconds": round(time.perf_counter() - began, 3),
+        "peak_memory_bytes": _peak(),
+        "ended": datetime.now(UTC).isoformat(timespec="seconds"),
+        "host": socket.gethostname(),
+        "process": os.getpid(),
+    }
+
+
+def _reset_peak() -> None:
+    """Make Linux forget the peak memory of the jobs that this process ran before."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _peak() -> int | None:
+    """Peak resident memory of this process, bytes; since `_reset_peak` on Linux."""
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
+    try:
+        import resource
+    except ImportError:  # Windows.
+        return None
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # macOS counts bytes.
+    return largest if sys.platform == "darwin" else 1024 * largest
+
+
+# Jobs run in this process, or by the workers of dask.distributed.
 
 _ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -39,7 +259,7 @@ _PATIENCE = 20
 class _Order:
     """Which jobs can start: injections wait for the job whose fit they start from."""
 
-    def __init__(self, todo: Sequence[Job], jobs: Path) -> None:
+    def __init__(self, todo: abc.Sequence[Job], jobs: Path) -> None:
         self.jobs = jobs
         self.first: list[Job] = []
         self.later: dict[str, list[Job]] = defaultdict(list)
@@ -59,7 +279,9 @@ class _Order:
         return [], [(each, failure(each, self.jobs, error)) for each in waiting]
 
 
-def in_this_process(todo: Sequence[Job], jobs: Path, work: Work) -> Iterator[tuple[Job, Record]]:
+def in_this_process(
+    todo: abc.Sequence[Job], jobs: Path, work: Work
+) -> Iterator[tuple[Job, Record]]:
     """Run jobs one after the other; yields each with its record."""
     order = _Order(todo, jobs)
     queue = deque(order.first)
@@ -73,7 +295,7 @@ def in_this_process(todo: Sequence[Job], jobs: Path, work: Work) -> Iterator[tup
 
 
 def with_dask(
-    todo: Sequence[Job],
+    todo: abc.Sequence[Job],
     jobs: Path,
     work: Work,
     *,

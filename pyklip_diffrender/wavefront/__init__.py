@@ -9,13 +9,15 @@ from pyklip_diffrender.wavefront.bases import (
     SegmentMotions,
     default_basis,
 )
-from pyklip_diffrender.wavefront.map_choice import RULES, choose_map, wavefront_for
 from pyklip_diffrender.wavefront.opd import (
+    RULES,
     OPDMap,
     as_opd_map,
+    choose_map,
     random_drift,
     random_opd,
     read_opd,
+    wavefront_for,
 )
 from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior, solve_with_evidence
 from pyklip_diffrender.wavefront.wss import interpolate_wss

@@ -20,9 +20,8 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.units import set_numbers, to_metres, to_number
-from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import Basis
-from pyklip_diffrender.wavefront.opd import resample
 
 __all__ = [
     "EvidenceUpdate",

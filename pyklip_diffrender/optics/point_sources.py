@@ -1,6 +1,6 @@
 """Point sources at every detector pixel, by convolution on a lattice aligned with the pixels.
 
-In the notation of `occulter`, a source on the axis has the field
+In the notation of `optics.fast_path`, a source on the axis has the field
 
     A(x) = F[L E](x) - sum_c K(x - c) B(c) F[E](c),     K = F[L],   B = (1 - t) cell / lambda.
 
@@ -31,15 +31,18 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.batches import batch_of
-from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.fast.occulter import OcculterLattice
-from pyklip_diffrender.optics.fast.path import LatticeRoute
-from pyklip_diffrender.optics.fourier import MatrixFourier
-from pyklip_diffrender.optics.planes import CompactOcculter, Plane, Wavefront
-from pyklip_diffrender.optics.system import OpticalSystem, Value
+from pyklip_diffrender.optics.fast_path import LatticeRoute, OcculterLattice
+from pyklip_diffrender.optics.planes import (
+    CompactOcculter,
+    Detector,
+    MatrixFourier,
+    Plane,
+    Wavefront,
+)
+from pyklip_diffrender.optics.system import OpticalSystem, Value, batch_of
 
 __all__ = ["PointSources"]
+
 
 Index = ArrayLike | Tensor
 
@@ -72,8 +75,8 @@ class PointSources:
     offset : tuple of float
         x, y in arcsec from the centre of a pixel to the source.
     wrapped : bool
-        Let the light of the mask's outer parts wrap around the detector, see `occulter`. Images
-        change by up to 5e-5, and take two thirds of the time.
+        Let the light of the mask's outer parts wrap around the detector, see
+        `optics.fast_path`. Images change by up to 5e-5, and take two thirds of the time.
 
     Attributes
     ----------
