@@ -295,11 +295,13 @@ def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
 
 def _klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
     # Runs in place of pyKLIP's code, with its globals: names of this module are not available.
+    from pyklip_diffrender.pyklip_backend.registration import dispatch
 
     return dispatch(*args, **kwargs)
 
 
 def _fm_klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
+    from pyklip_diffrender.pyklip_backend.registration import dispatch_fm
 
     return dispatch_fm(*args, **kwargs)
 
