@@ -235,7 +235,9 @@ def test_attributes_that_the_text_names_exist(path: Path) -> None:
         assert hasattr(dr, name), f"{path.name}: no dr.{name}"
 
 
+@pytest.mark.slow
 def test_generated_tables_have_every_option_and_keyword() -> None:
+    pytest.importorskip("numpydoc", reason="the extra docs is not installed")
     """The page of options shows the fields, defaults and descriptions that the code has."""
     path = ROOT / "docs" / "generate.py"
     spec = importlib.util.spec_from_file_location("generate", path)
