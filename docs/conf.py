@@ -56,7 +56,7 @@ nitpick_ignore_regex = [
     ("py:obj", r"[^.]*"),
     ("py:obj", r"(poppy|pyklip|spaceKLIP|stpsf|torch|webbpsf)\..*"),
     ("py:obj", r"(GaussNewton|RoundMask|calibration|contrast|spectrum)\..*"),
-    ("py:obj", r"pyklip_diffrender\.(linear|pyklip_backend\.subtract|scene\.measured_noise)\..*"),
+    ("py:obj", r"pyklip_diffrender\.(linear|pyklip_backend\.subtract|scene\.integrations)\..*"),
 ]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3

@@ -364,8 +364,8 @@ def reduce(
     resume : bool
         Go on with a reduction that was interrupted after its products in `output` were written
         for the first time. Frames, map and options must be the same, but for injections and
-        completeness. What the frames of reference stars contributed (`Reduction.visit`) is kept;
-        fits of reference stars by themselves, for a pattern (`Reduction.references`), are not.
+        completeness. What the frames of reference stars contributed (``Reduction.visit``) is kept;
+        fits of reference stars by themselves, for a pattern (``Reduction.references``), are not.
     **keywords
         Fields of `ReduceOptions`: ``size``, ``systematics``, ``settings``, ``threshold``,
         ``wide``, ``disk``, ``injections``, ``completeness``, ``star_flux``, ``star_flux_error``,
