@@ -187,7 +187,7 @@ def verified(output: Path) -> tuple[dict[str, int], int]:
             continue
         for k in range(PARTS):
             content = (path / f"part{k}.bin").read_bytes()
-            require(content == part(path.name, k), f"{path}: wrong content")
+            require(content == part(record["job"]["key"], k), f"{path}: wrong content")
         finished[path.name] = (path / jobs.RECORD).stat().st_mtime_ns
     return finished, failed
 
