@@ -307,8 +307,8 @@ def _detection() -> list[Breakage]:
         ),
         Breakage(
             "inner", "no candidate is inside the smallest separation",
-            "if separation_of(candidates.offsets.numpy())[-1] < inner:",
-            "if len(candidates) > 10:", "detection search",
+            "if separation_of(more.offsets.numpy())[-1] < self.inner:",
+            "if len(more) > 10:", "detection search",
         ),
         Breakage(
             "inflation", "errors grow with the square root of chi-squared",
