@@ -6,7 +6,8 @@ Run from the root of the project::
 
 Frames of a star are simulated in two and in three filters and at two epochs, each with a wavefront
 that has drifted since the map, and fitted and searched by `refine` and `detect`. The searches are
-combined by `combine`. The table has, for each set:
+combined by `combine`. Numbers of finished sequences are kept beside the table (`.jsonl`), and not
+computed again. The table has, for each set:
 
 - the standard deviation of the S/N of noise, without planets, of single and combined searches;
 - how many searches of noise have a peak above a lowered threshold, of a single filter and of all
@@ -21,6 +22,7 @@ companions, by how far the star moves in units of the error of a place.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 from collections.abc import Sequence
@@ -150,37 +152,19 @@ def main() -> None:
     torch.set_num_threads(1)
     names: list[str] = []
     rows: list[dict[str, float]] = []
-    members = sorted({each for parts in SETS.values() for each in parts})
-    results: dict[str, list[tuple[list[Detection], dr.Combination]]] = {name: [] for name in SETS}
-    for seed in range(options.sequences):
-        singles = {each: searched(*each, seed) for each in members}
-        for name, parts in SETS.items():
-            chosen = [singles[each] for each in parts]
-            results[name].append((chosen, combined(chosen, LEVEL)))
+    kept = options.output.with_suffix(".jsonl")
+    known = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
+    for seed in range(len(known), options.sequences):
+        known.append(sequence(seed))
+        with open(kept, "a", encoding="utf-8") as file:
+            file.write(json.dumps(known[-1]) + "\n")
         print(f"sequence {seed + 1} of {options.sequences}", flush=True)
-    for name, runs in results.items():
-        count = len(runs)
-        spread = [np.nanstd(both.snr[:, separation_of(both.grid) >= INNER]) for _, both in runs]
-        limits = []
-        squares = []
-        for chosen, _ in runs:
-            best, sum_of_squares, all_ = gain(chosen)
-            limits.append(best / all_)
-            squares.append(best * sum_of_squares**0.5)
-        singles_above = [highest(each) > LEVEL for chosen, _ in runs for each in chosen]
-        alarms = [len(both.candidates) > 0 for _, both in runs]
+    for name in SETS:
         names.append(name)
+        parts = [each[name] for each in known[: options.sequences]]
         rows.append(
-            {
-                "searches": count,
-                "snr_single": np.mean([deviation(each) for chosen, _ in runs for each in chosen]),
-                "snr_combined": float(np.mean(spread)),
-                "false_single": float(np.mean(singles_above)),
-                "false_combined": float(np.mean(alarms)),
-                "false_stated": stated(runs[0][1]),
-                "gain": float(np.mean(limits)),
-                "gain_without_trials": float(np.mean(squares)),
-            }
+            {"searches": len(parts)}
+            | {key: float(np.mean([each[key] for each in parts])) for key in parts[0]}
         )
     for ratio in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0):
         names.append(f"background, motion of {ratio:g} errors")
@@ -201,6 +185,27 @@ def main() -> None:
     }  # fmt: skip
     table.write(options.output, format="ascii.ecsv", overwrite=True)
     table.pprint_all()
+
+
+def sequence(seed: int) -> dict[str, dict[str, float]]:
+    """Simulate one star in all filters and epochs; numbers by set."""
+    members = sorted({each for parts in SETS.values() for each in parts})
+    singles = {each: searched(*each, seed) for each in members}
+    numbers = {}
+    for name, parts in SETS.items():
+        chosen = [singles[each] for each in parts]
+        both = combined(chosen, LEVEL)
+        best, squares, all_ = gain(chosen)
+        numbers[name] = {
+            "snr_single": float(np.mean([deviation(each) for each in chosen])),
+            "snr_combined": float(np.nanstd(both.snr[:, separation_of(both.grid) >= INNER])),
+            "false_single": float(np.mean([highest(each) > LEVEL for each in chosen])),
+            "false_combined": float(len(both.candidates) > 0),
+            "false_stated": stated(both),
+            "gain": best / all_,
+            "gain_without_trials": best * squares**0.5,
+        }
+    return numbers
 
 
 def gain(chosen: Sequence[Detection]) -> tuple[float, float, float]:
