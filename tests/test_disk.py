@@ -305,7 +305,9 @@ def test_products_of_pyklip_keep_a_ring() -> None:
         advice = pytest.warns(DiffrenderWarning, match="disk=True for a star with a disk")
         with nullcontext() if fits_disk else advice:
             subtraction = subtract_by_refinement(observation, dr.random_opd(1, npix=128), asked)
-        assert (subtraction.disk is not None) == fits_disk
+        reduction = subtraction.reduction
+        assert reduction is not None
+        assert (reduction.disk is not None) == fits_disk
         residuals = observation.data - subtraction.star
         amounts["subtracted", fits_disk] = amount(np.nan_to_num(residuals[0]), rings[0])
         images = ProductImages(subtraction)

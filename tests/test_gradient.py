@@ -280,7 +280,7 @@ def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
     # Equations of the starting values precondition as well.
     start = solver.objective.at(state.unknowns, state.unknowns.initial())
     earlier = linearise(solver.objective, start, 0.1, len(BASIS), 4.0)
-    direct = same._solve(state.unknowns, fine).step - fine.current
+    direct = same._solve(state.unknowns, fine, priors).step - fine.current
     steps = []
     for equations in (coarse, earlier):
         step, settled = accurate_step(
@@ -295,7 +295,7 @@ def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
         assert not settled  # Every iteration lowers it, if only by a little.
         steps.append(step)
     too_coarse = solver._solve(state.unknowns, coarse, priors).step - coarse.current
-    errors = same._solve(state.unknowns, fine, errors=True).variance.sqrt()
+    errors = same._solve(state.unknowns, fine, priors, errors=True).variance.sqrt()
     assert (direct / errors).norm() > 10
     for step in steps:
         assert ((step - direct) / errors).norm() < 0.3

@@ -400,10 +400,10 @@ def limits_table(
     half_width = abs(float(grid[1, 1, 1] - grid[0, 0, 1])) / 2
     rows = []
     for k, name in enumerate(spectra.names):
+        f = int(np.argmax(weights[k][:, known].mean(axis=1)))
         for separation in np.arange(inner, edge, _STEP):
             ring = (np.abs(distance - separation) <= half_width) & np.isfinite(errors[k])
             if ring.any():
-                f = int(np.argmax(weights[k][:, ring].mean(axis=1)))
                 flux = level * float(np.median(errors[k][ring])) * spectra.flux[k, f]
                 contrast = flux / stars[spectra.filters[f]]
                 rows.append((name, separation, spectra.filters[f], contrast))
@@ -413,7 +413,7 @@ def limits_table(
             ("spectrum", np.array(names, dtype="U60"), None, "", "of the planet"),
             ("separation", np.array(places, dtype=float), u.arcsec, ".2f", "from the star"),
             ("filter", np.array(best, dtype="U12"), None, "",
-             "to which the contrast refers: the one in which such a planet is seen best"),
+             "to which the contrast refers: that in which such a planet is seen best"),
             ("contrast", np.array(contrasts, dtype=float), None, ".3e",
              "of a planet that reaches the threshold, median of the ring"),
             ("delta_mag", magnitudes(np.array(contrasts, dtype=float))[0], u.mag, ".3f",
