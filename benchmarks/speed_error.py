@@ -18,8 +18,7 @@ point; ways that differ in one setting, such as the samples across the pupil, ar
 The error of images and fits is the rms error of the star in units of the noise (sigma). Takes about
 four minutes on two idle cores, of which stpsf takes one, and two more for one roll of real frames;
 without stpsf and its data (STPSF_PATH) its points are left out. ``--quick`` sees whether all runs.
-``--committed`` measures nothing, and takes the points from tables of earlier benchmarks. Writes
-speed_error.ecsv and speed_error.png, which the documentation shows.
+Writes speed_error.ecsv and speed_error.png, which the documentation shows.
 """
 
 from __future__ import annotations
@@ -37,6 +36,7 @@ import numpy as np
 import torch
 from astropy.table import Table
 from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -61,16 +61,15 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 MODES_OF_GRADIENTS = 6.0
 """Cycles across the pupil of the modes by which gradients are compared."""
 
-_ALIKE = "poppy, FFT, oversample 4"
-"""Way of `benchmarks.speed` whose error is like that of stpsf."""
-
 ADAM_STEPS, LEARNING_RATE = 1000, 1e-11
+
+_OTHERS = ("the paper's recipe", "stpsf", "poppy", "prysm", "hcipy", "KLIP")
+"""Ways of other codes begin with one of these."""
 
 TITLES = {
     "image": "One image, 4.5 um",
     "broad image": "One image in F444W",
     "gradient": "Image and gradient, 4.5 um",
-    "step": "Image and gradient, 4.5 um",
     "fit": "Fit of one frame, 4.5 um",
     "reduction": "Reduction of real frames",
 }
@@ -80,7 +79,6 @@ UNITS = {
     "image": "rms error (sigma)",
     "broad image": "rms error (sigma)",
     "gradient": "relative error of the gradient",
-    "step": "rms error of the image (sigma)",
     "fit": "rms error of the star (sigma)",
     "reduction": "median change of the limits",
 }
@@ -332,34 +330,6 @@ def reduction_points(frames: Sequence[Path], opd: Path, *, quick: bool) -> list[
     return points
 
 
-def committed_points(folder: Path) -> list[Point]:
-    """Points of the tables of `benchmarks.speed` and `klip_table.py`, as far as they have them."""
-    table = Table.read(folder / "performance.ecsv")
-    kinds = {"forward": "image", "forward + backward": "step", "refinement": "fit"}
-    points = []
-    for row in table[table["precision"] == "float64"]:
-        what, column = kinds.get(str(row["row"])), str(row["column"])
-        sigma, remark = float(row["sigma"]), ""
-        if column.startswith("stpsf"):
-            # Its row has the largest error over the peak alone; of poppy's, which is alike, both.
-            (alike,) = table[(table["row"] == "forward") & (table["column"] == _ALIKE)]
-            sigma = float(row["error"] * alike["sigma"] / alike["error"])
-            remark = "; sigma by the ratio of poppy's errors"
-        if what is None or not np.isfinite(sigma):
-            continue
-        way, _, label = column.partition(", ")
-        if way in ("multi-fidelity", "coarse alone"):
-            way = {"multi-fidelity": "change of a fine image, on fewer samples"}.get(
-                way, "fewer samples across the pupil"
-            )
-            label = f"{label} samples"
-        elif what != "fit" and way == "this package":
-            way, label = "fewer samples across the pupil", f"{label} samples"
-        note = f"{table.meta['command']}, {table.meta['date']}{remark}"
-        points.append(Point(what, way, label, row["seconds"], sigma, note=note))
-    return [*points, *klip_points(folder / "klip_table_measured.ecsv")]
-
-
 def stpsf_points(setting: Setting, budget: float) -> list[Point]:
     """stpsf's own calc_psf for several samplings, and the same arrays in this package."""
     if setting.data is None:
@@ -449,7 +419,7 @@ def draw(table: Table) -> Figure:
         rows = table[table["what"] == what]
         for way in dict.fromkeys(map(str, rows["way"])):
             line = rows[rows["way"] == way]
-            ours = way.startswith(("this package", "fewer", "change", "single"))
+            ours = not way.startswith(_OTHERS)
             # The setting of a single point is part of the name of its way.
             alone = str(line["setting"][0]) if len(line) == 1 else ""
             ax.loglog(
@@ -467,6 +437,8 @@ def draw(table: Table) -> Figure:
             # The noise of a pixel.
             ax.axhline(1.0, color="0.7", lw=1, zorder=0)
         ax.margins(0.2)
+        if max(ax.get_xlim()) < 20 * min(ax.get_xlim()):
+            ax.xaxis.set_minor_formatter(ScalarFormatter())
         ax.legend(
             fontsize=7, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.08), ncols=2
         )
@@ -483,19 +455,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--device", default="cpu", help="torch device of this package")
     parser.add_argument("--frames", nargs="+", type=Path, metavar="FILE", help="real frames")
     parser.add_argument("--opd", type=Path, metavar="FILE", help="wavefront map of the frames")
-    parser.add_argument(
-        "--committed", action="store_true", help="take the points from tables of docs/results"
-    )
     parser.add_argument("--figure", type=Path, metavar="TABLE", help="only draw a table again")
     options = parser.parse_args(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
     command = "python -m benchmarks.speed_error"
     if options.figure:
         table = Table.read(options.figure)
-    elif options.committed:
-        table = as_table(committed_points(RESULTS), f"{command} --committed")
-        table.meta["provenance"] = ["of the tables and dates in the column note"]
-        write_table(table, options.output / "speed_error.ecsv")
     else:
         setting = Setting(options.quick, options.device)
         points = measure(
