@@ -121,13 +121,7 @@ WHAT_TO_CHECK = (
 
 @contextmanager
 def breakdown_explained(name: str) -> Iterator[None]:
-    """Turn a breakdown of the linear algebra of a fit into a `RefinementError`.
-
-    Parameters
-    ----------
-    name : str
-        Of the frames, for the message.
-    """
+    """Turn a breakdown of a fit's linear algebra into a `RefinementError` that names the frames."""
     try:
         yield
     except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]

@@ -432,14 +432,7 @@ def quick_settings(observation: Observation) -> GaussNewton:
 
 
 def nircam_settings(observation: Observation, **changes: Any) -> GaussNewton:
-    """Return the NIRCam preset for an observation's filter, mask and module.
-
-    Parameters
-    ----------
-    observation : Observation
-    **changes
-        See `GaussNewton.nircam`.
-    """
+    """Return the preset `GaussNewton.nircam` for an observation's filter, mask and module."""
     header, name = observation.header, observation.name
     mask = image_mask(header, name)
     return GaussNewton.nircam(
