@@ -158,11 +158,7 @@ def _edges(middles: NDArray[np.float64]) -> NDArray[np.float64]:
 def injected_planets(ax: Axes, planets: QTable) -> None:
     """Draw recovered over injected contrast against separation.
 
-    Parameters
-    ----------
-    ax : Axes
-    planets : QTable
-        Columns separation, injected, contrast, contrast_error and detected.
+    `planets` has columns separation, injected, contrast, contrast_error and detected.
     """
     ratio, error = (
         np.asarray(planets[name] / planets["injected"]) for name in ("contrast", "contrast_error")
@@ -184,18 +180,10 @@ def survey_limits(
     candidates: Sequence[tuple[float, float]],
     sigmas: float,
 ) -> None:
-    """Draw contrast limits against separation for all stars, with their candidates.
+    """Draw contrast limits at `sigmas` against separation for all stars, with their candidates.
 
-    Parameters
-    ----------
-    ax : Axes
-    curves : sequence of (str, array, array)
-        Name, separations in arcsec, and contrasts. If there are more than there are colours, the
-        curves are grey and their median is shown.
-    candidates : sequence of (float, float)
-        Separation and contrast.
-    sigmas : float
-        Significance of the limits.
+    A curve is a name, separations in arcsec and contrasts; a candidate is a separation and a
+    contrast. If there are more curves than colours, they are grey and their median is shown.
     """
     few = len(curves) <= len(_COLORS)
     for k, (name, separation, contrast) in enumerate(curves):
