@@ -203,25 +203,15 @@ def combine(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """One way to add maps: an epoch alone, or all with the motion of a hypothesis.
-
-    Attributes
-    ----------
-    name : str
-    maps : tuple of SkyMap
-    moves : tuple of dict
-        Offsets, (2,), by the name of the map; several for different orbital motions.
-    speeds : tuple of float
-        Largest part of `moves` that is orbital, arcsec per year, which limits the separation.
-    reference : float
-        Epoch of the places, MJD.
-    """
+    """One way to add maps: an epoch alone, or all with the motion of a hypothesis."""
 
     name: str
     maps: tuple[SkyMap, ...]
+    # Offsets, (2,), by the name of the map; several for different orbital motions.
     moves: tuple[dict[str, Image], ...]
+    # Largest part of `moves` that is orbital, arcsec per year, which limits the separation.
     speeds: tuple[float, ...]
-    reference: float
+    reference: float  # Epoch of the places, MJD.
 
 
 @dataclass(frozen=True, eq=False)

@@ -284,21 +284,7 @@ class SkyModel:
         return self._filtered(sources.reshape(self.shape), self._response)
 
     def error(self, seed: int = 0) -> Image:
-        """Standard deviation that the noise of the frames has in the estimate, by separation.
-
-        With A = (1 + B^T Sigma^-1 B)^-1, the covariance of u is A - A^2. The diagonal of that of
-        the image, Q, is the expectation of z * (Q z) for random signs z (C. Bekas, E. Kokiopoulou
-        and Y. Saad 2007, Applied Numerical Mathematics 57, 1214).
-
-        Parameters
-        ----------
-        seed : int
-            Of the signs.
-
-        Returns
-        -------
-        ndarray, (ny, nx)
-        """
+        """Standard deviation of the estimate by the frames' noise, by separation, (ny, nx)."""
         # With A = (1 + B^T Sigma^-1 B)^-1, the covariance of u is A - A^2. The diagonal of that of
         # the image, Q, is the expectation of z * (Q z) for random signs z (C. Bekas, E. Kokiopoulou
         # and Y. Saad 2007, Applied Numerical Mathematics 57, 1214).
