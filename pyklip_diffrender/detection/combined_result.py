@@ -358,6 +358,9 @@ def limits_table(
     half_width = abs(float(grid[1, 1, 1] - grid[0, 0, 1])) / 2
     rows = []
     for k, name in enumerate(spectra.names):
+        # At the threshold the amplitude of a spectrum s is `level` times its error, and the flux in
+        # filter f is that amplitude times s_f. Contrasts are stated for the filter with the most
+        # weight.
         f = int(np.argmax(weights[k][:, known].mean(axis=1)))
         for separation in np.arange(inner, edge, _STEP):
             ring = (np.abs(distance - separation) <= half_width) & np.isfinite(errors[k])

@@ -541,6 +541,7 @@ def _fit_sources(
     images = templates.at_pixels(*pixels)
     flux, before = fit.frames[0].flux, np.zeros(len(pixels[0]))
     if start is not None:
+        # The star was fitted without this light, which is added to the data again.
         linear = linear.without("companions", start.light)
         if all(map(np.array_equal, start.pixels, pixels)):
             before = start.contrasts * (start.flux / flux)

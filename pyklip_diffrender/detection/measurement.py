@@ -93,6 +93,8 @@ def measured_shape(
     total, bright = amplitude, amplitude > relinearise * error
     single_frame = len(fits) == 1 and len(fits[0].frames) == 1
     factor = scatter
+    # Light of a bright source biases the wavefront, and part of it is taken for the star. Without
+    # the light that was found so far, the next amplitude is what is left.
     for _ in range(_ROUNDS if bright and single_frame else 0):
         fit = without_light(fits[0], {0: total * light})
         amplitude, error = _amplitude(fit.star_only, shape)

@@ -143,6 +143,7 @@ class Templates:
         Those that are not on the detector have no light.
         """
         detector = self.frames[k].model.detector
+        # In thirds of a pixel, a place is 3 times the nearest pixel plus -1, 0 or 1.
         fine = (_FINE * self._pixels(k, offsets)).round().to(torch.int64)
         pixel = torch.div(fine + _FINE // 2, _FINE, rounding_mode="floor")
         part = fine - _FINE * pixel
@@ -196,6 +197,7 @@ class Templates:
         """
         frame = self.frames[k]
         place = self._star(frame) + _BEYOND
+        # The pixel n // 2 of an even number is half a pixel beyond the middle of the array.
         middle = torch.tensor(
             [
                 0.0 if n % 2 else scale / 2

@@ -104,6 +104,8 @@ def corner(names: Sequence[str], values: Array, covariance: Array, labels: Seque
             ax.set_ylim(0, 1.1)
         else:
             pair = [column, row]
+            # With a covariance L L^T, the ellipse of one standard deviation is L times the unit
+            # circle.
             root = np.linalg.cholesky(covariance[np.ix_(pair, pair)])
             circle = root @ np.stack([np.cos(turn), np.sin(turn)])
             for sigmas in _SIGMAS:

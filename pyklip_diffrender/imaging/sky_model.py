@@ -243,6 +243,7 @@ class SkyModel:
         def norm(images: Image) -> Image:
             return np.asarray((images**2).sum(axis=(1, 2)))
 
+        # All systems have the same matrix, and each its own lengths along its directions.
         solution, residual = np.zeros_like(right), right.copy()
         direction, size = right.copy(), norm(right)
         enough = _TOLERANCE**2 * size

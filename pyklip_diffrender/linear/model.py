@@ -467,6 +467,7 @@ class LinearModel:
             Image of those unknowns by frame, in the data's unit.
         """
         keeps = torch.tensor([unknown.name != name for unknown in self.unknowns])
+        # `place` is the new index of every unknown that stays.
         place = torch.cumsum(keeps, 0) - 1
         frames = []
         for k, frame in enumerate(self.frames):

@@ -275,6 +275,7 @@ class FrameFit:
         values = self.optical_values
         if center is not None:
             ny, nx = model.detector.shape
+            # The place of the star is counted from the middle of the array.
             old = self.observation.center[0] - (np.array(self.observation.shape[::-1]) - 1) / 2
             moved = np.array(center) - (np.array([nx, ny]) - 1) / 2 - old
             shift = torch.from_numpy(moved * np.array(model.detector.pixelscale))

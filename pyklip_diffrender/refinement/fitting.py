@@ -167,6 +167,8 @@ def align_frame(
         max_companions=0,
         deviations={n: d for n, d in settings.deviations.items() if n in own},
     )
+    # What is not the frame's own keeps the values of the fit: they are the starting values of
+    # parameters that are not free.
     shared = {
         name: value
         for name, value in first.values.items()

@@ -385,6 +385,9 @@ class Forward:
         """
         unknowns, vector = point.unknowns, point.vector
         flux, gain = unknowns.level("flux", vector), self.problem.gain
+        # With the images S of the star and p_k of companions at flux 1, and the pattern g,
+        #
+        #     total = F (g S + sum_k c_k p_k) + background + pedestal (g - 1).
         by_level = {
             "flux": gain * point.image,
             "background": torch.ones_like(point.image),
@@ -403,6 +406,8 @@ class Forward:
             with torch.no_grad():
                 rows.append((flux * self.coarse(opd, **values)).float().cpu())
             moved = self._position_slopes(opd, values)
+            # The place in this frame is R x, so that the derivative by x is R^T times that by the
+            # place.
             turned = torch.tensordot(unknowns.turn.T, moved, dims=1)
             rows += list((flux * source[0] * turned).float())
         return torch.stack(rows) if rows else torch.zeros(0, *point.image.shape)

@@ -447,6 +447,8 @@ class ModelDerivatives:
         for k, (forward, point) in enumerate(
             zip(objective.forwards, self._state.points, strict=True)
         ):
+            # `inverse` has C^-1 x over w. Levels and companions have images in `_levels`, and the
+            # derivatives by the other unknowns come from reverse mode.
             pixels = self._noise.weight[k] * whitened[k]
             where, levels = point.unknowns.slices, self._levels[k]
             of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
@@ -654,6 +656,8 @@ class EquationsCache:
         """Linearise about a state, with derivatives whose error is at most `allowed`."""
         outweighing = 0.0 if final else kappa
         bright = state.bright_companions(outweighing)
+        # Jacobians do not depend on the weights of pixels, so that they stay right at the same
+        # state.
         last, reading = self.last, self._responses.reading(allowed, len(state.points) + bright)
         jacobians: list[Tensor] = []
         error = None
@@ -715,6 +719,7 @@ class Solver:
                 "flux is not free and start has no 'flux': how bright is the star? Add 'flux' to "
                 "free, or give start={'flux': light that the pupil collects}"
             )
+        # Bytes of the Jacobians by modes, in single precision, which are always stored.
         jacobians = 4.0 * len(problems) * (len(basis) + settings.prior.amplitude_modes(basis))
         jacobians *= math.prod(problems[0].observation.shape)
         responses = ResponseCache(
