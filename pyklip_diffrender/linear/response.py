@@ -174,8 +174,8 @@ class LastPupil:
     ) -> Tensor:
         """Factor of the spectrum of the samples, (ny, nx)."""
         detector = self._model.detector
-        # The frequency f of samples that are t apart on the sky stands for the place lambda f / t in
-        # the pupil, where a shift of the image is a tilt of the OPD. The sign of y is that of
+        # The frequency f of samples that are t apart on the sky stands for the place lambda f / t
+        # in the pupil, where a shift of the image is a tilt of the OPD. The sign of y is that of
         # `optics.planes`. The shear of the axes is negligible here.
         x, y = (
             torch.fft.fftfreq(count, dtype=torch.float64, device=field.device)

@@ -66,7 +66,7 @@ class Course:
     carried: StepState  # What the last step hands on to the next one.
     # Those of the fit, with the size of the drift between frames once it is measured.
     settings: GaussNewton
-    kappa: float  # Assumed error of the star model, as a fraction of the star.
+    kappa: float  # Model error that the next step assumes.
     modes: int  # Number of leading wavefront modes that are free; 0 for the alignment.
     remaining: int  # Number of steps that may follow.
     error: float = math.inf  # Model error of `state`.
@@ -312,8 +312,7 @@ def conclude(
 ) -> Refinement:
     """Compute errors about a final state, and make the result; `about` has history and duration.
 
-    Settings and priors are those of the final state. The errors include the model error `kappa`, a
-    fraction of the star.
+    Settings and priors are those of the final state. The errors include the model error `kappa`.
     """
     problems = [forward.problem for forward in solver.objective.forwards]
     modes = len(solver.basis) if settings.wavefront else 0
@@ -460,7 +459,7 @@ class _Fitted:
 
 
 # How the model error decreases. With the data d, the star s, and the noise sigma of a pixel, the
-# error of the star model is the fraction e of the star for which chi-squared per pixel is 1,
+# model error is the fraction e of the star for which chi-squared per pixel is 1,
 #
 #     mean of (d - s)^2 / (sigma^2 + (e s)^2) = 1,
 #

@@ -323,7 +323,7 @@ class Forward:
         """Derivative of `total`, (unknowns, ny, nx), float32, on the CPU.
 
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront. The
-        light of companions that are faint, or that an error `kappa` of the star model outweighs,
+        light of companions that are faint, or that a model error `kappa` outweighs,
         counts as independent of optics and wavefront. `reading` takes the derivatives of the field.
         """
         reading = self.responses.reading() if reading is None else reading

@@ -268,7 +268,7 @@ class NormalEquations:
     """Normal equations of a state, for the unknowns minus their starting values."""
 
     state: State
-    kappa: float  # Assumed error of the star model, as a fraction of the star.
+    kappa: float  # Model error.
     robust: float  # Residual of half weight, standard deviations; inf for least squares.
     curvature: Tensor  # (unknowns, unknowns), J C^-1 J^T, see `Noise`.
     gradient: Tensor  # (unknowns,), g = J C^-1 r with the residual r at the starting values.
@@ -607,7 +607,7 @@ class StepState:
 
     priors: ModePriors  # With the scales that the step has fitted, unless they are fixed.
     damping: float = 0.0  # Levenberg-Marquardt damping of the next step.
-    kappa: float = math.inf  # Model error that the step has assumed, as a fraction of the star.
+    kappa: float = math.inf  # Model error that the step has assumed.
     # Whether the next step needs derivatives of the model itself, unless kappa grows.
     needs_accurate: bool = False
 

@@ -43,7 +43,7 @@ COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 def brightest(sources: Tensor, kappa: float = 0.0) -> Tensor:
     """The brightest of companions (k, 3), if its light depends noticeably on the wavefront.
 
-    The result is (1, 3), or (0, 3) if none does or an error `kappa` of the star model outweighs it.
+    The result is (1, 3), or (0, 3) if none does or a model error `kappa` outweighs it.
     """
     # One, because its derivatives take as long as those of the star.
     first = sources[sources[:, 0].argsort(descending=True)[:1]]
