@@ -8,7 +8,7 @@ unknowns of the star marginalised. Different fits share no unknowns, so a source
 
 where F_f and e_f are the flux density in a filter and its error: those of the joint likelihood of
 all frames. The spectrum is not known, and the highest S/N of a family of spectra has more trials
-than that of one, see `trials`. In what follows, places are offsets from the star to the east and to
+than that of one, see `Family`. In what follows, places are offsets from the star to the east and to
 the north, arcsec.
 """
 

@@ -106,15 +106,9 @@ def completeness(
 ) -> None:
     """Draw the fraction of planets that are found against separation and contrast.
 
-    Parameters
-    ----------
-    ax : Axes
-    table : QTable
-        Columns separation, contrast and completeness, with as many contrasts at each separation.
-    curve : QTable
-        Columns separation and contrast: the limits at 5 sigma.
-    half, most : sequence of float
-        Contrasts at which 50 and 95 % are found, by separation; may be NaN.
+    `table` has columns separation, contrast and completeness, with as many contrasts at each
+    separation, and `curve` separation and contrast of the limits at 5 sigma. `half` and `most` are
+    the contrasts at which 50 and 95 % are found, by separation; may be NaN.
     """
     place, contrast = table["separation"].value, np.asarray(table["contrast"])
     fraction = np.asarray(table["completeness"])

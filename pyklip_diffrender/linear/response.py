@@ -211,7 +211,7 @@ class LastPupil:
 
 # Derivatives of the image with respect to named parameters, such as a shift of the Lyot stop.
 #
-# As in `response`, the derivative of the complex field may come from a coarser model than the
+# As by the wavefront, the derivative of the complex field may come from a coarser model than the
 # field.
 
 _IMAGE_PARAMETERS = ("blur",)
