@@ -425,11 +425,10 @@ class Significance:
 
 
 def _derivatives(reach: int) -> tuple[Image, Image]:
-    """Weights of samples -reach, ..., reach whose sums are the derivatives in the middle.
-
-    First and second derivatives of a function without frequencies beyond those of its samples,
-    which is the sum of sinc functions.
-    """
+    """Weights of samples -reach, ..., reach whose sums are the derivatives in the middle."""
+    # First and second derivatives of a function without frequencies beyond those of its samples,
+    # which is the sum of sinc functions sin(pi x) / (pi x): these have the slope (-1)^k / k and the
+    # curvature -2 (-1)^k / k^2 at k, and -pi^2 / 3 in the middle.
     places = np.arange(-reach, reach + 1)
     away = np.where(places == 0, 1, places)
     signs = np.where(places % 2 == 0, 1.0, -1.0)

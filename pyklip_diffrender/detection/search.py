@@ -66,11 +66,9 @@ _DEGENERATE = 1e-6
 
 
 def follows_scatter(fits: Sequence[Refinement]) -> bool:
-    """Whether errors are multiplied by the scatter of the S/N, and not by chi-squared alone.
-
-    On real frames, and where a fit does not explain its data, errors of the model that neighbouring
-    pixels share do not show in chi-squared.
-    """
+    """Whether errors are multiplied by the scatter of the S/N, and not by chi-squared alone."""
+    # On real frames, and where a fit does not explain its data, errors of the model that
+    # neighbouring pixels share do not show in chi-squared.
     explained = all(fit.status.calibrated for fit in fits)
     return not explained or fits[0].frames[0].observation.is_nircam
 
@@ -717,12 +715,10 @@ class _PeakSearch:
         return replace(peaks, candidates=more, within=within)
 
     def _dropped(self, peaks: _Peaks, snr: Image, factor: ErrorFactor) -> _Peaks | None:
-        """Drop the weakest candidate that is none with the present factor; None if all are.
-
-        The factor may have grown since a candidate was accepted. Side lobes of a source within
-        `inner` are no candidates, however significant they are.
-        """
+        """Drop the weakest candidate that is none with the present factor; None if all are."""
         candidates = peaks.candidates
+        # The factor may have grown since a candidate was accepted. Side lobes of a source within
+        # `inner` are no candidates, however significant they are.
         margin = candidates.snr(factor) - factor.threshold(self.threshold, candidates.offsets)
         if not len(candidates) or margin.min() >= 0:
             lobes = side_lobes(self.maps, snr, candidates, factor, self.threshold, self.inner)

@@ -635,11 +635,10 @@ def _density(dimension: int, level: float) -> float:
 
 
 def _orthant(count: int) -> NDArray[np.float64]:
-    """Lipschitz-Killing curvatures of the part of a sphere without negative coordinates, (count,).
-
-    The length of a vector of noise without its negative coordinates is chi of k degrees of freedom
-    with the probability C(count, k) / 2^count, and chi is the maximum over a whole sphere.
-    """
+    """Lipschitz-Killing curvatures of the sphere's part without negative coordinates, (count,)."""
+    # The length of a vector of noise without its negative coordinates is chi of k degrees of
+    # freedom with the probability C(count, k) / 2^count, and chi is the maximum over a whole
+    # sphere.
     total = np.zeros(count)
     for k in range(1, count + 1):
         for d in range(k - 1, -1, -2):

@@ -380,9 +380,9 @@ def downsample(opd: Tensor, npix: int) -> Tensor:
 class WavefrontResponse:
     """Derivative of the complex field on the detector with respect to wavefront modes.
 
-    It is linearised about `opd` (n, n), m, on a coarse copy of `npix` pupil samples, at
-    `wavelengths` at most. With `stored` the derivatives are computed now; otherwise in every call
-    of `image` until `store` is called.
+    It is about `opd` (n, n), m, of a coarse copy of `npix` pupil samples with at most so many
+    `wavelengths`. With `stored` the derivatives are computed now; otherwise in every call of
+    `image` until `store` is called.
     """
 
     def __init__(

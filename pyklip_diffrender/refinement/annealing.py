@@ -591,12 +591,10 @@ class Annealing:
         return False
 
     def _restart(self, course: Course, added: Sequence[Planet]) -> None:
-        """Go on with more companions: from here near the solution, else from the alignment.
-
-        Near the solution the model is linear, so that further steps remove the bias of the
-        wavefront.
-        """
+        """Go on with more companions: from here near the solution, else from the alignment."""
         is_close = course.error < _NEAR
+        # Near the solution the model is linear, so that further steps remove the bias of the
+        # wavefront.
         course.state = self._with_companions(course.state if is_close else course.aligned, added)
         course.least, course.remaining = NOTHING, self.settings.max_iterations
         course.may_drop, course.carried = False, course.carried.without_damping()

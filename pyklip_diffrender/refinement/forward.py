@@ -323,8 +323,8 @@ class Forward:
         """Derivative of `total`, (unknowns, ny, nx), float32, on the CPU.
 
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront. The
-        light of companions that are faint, or that a model error `kappa` outweighs,
-        counts as independent of optics and wavefront. `reading` takes the derivatives of the field.
+        light of companions that are faint, or that a model error `kappa` outweighs, counts as
+        independent of optics and wavefront. `reading` takes the derivatives of the field.
         """
         reading = self.responses.reading() if reading is None else reading
         unknowns, bright = point.unknowns, point.unknowns.bright_sources(point.vector, kappa)
@@ -527,7 +527,7 @@ class State:
 
 
 class Objective:
-    """Compares states with the data of all frames, whose forwards it takes.
+    """Compares states with the data of all frames, each with its `Forward`.
 
     `robust` is the residual in standard deviations with half the weight (Cauchy's loss); inf for
     least squares.

@@ -474,8 +474,7 @@ def accurate_step(
 
     `curvature` (some, some) is approximate and by the leading unknowns, the only ones that the step
     changes. `offset` (unknowns,) is from the means of the priors, whose standard deviations are
-    `deviation`. The flag says whether another iteration would hardly have lowered chi-squared; the
-    last arguments are those of `conjugate_gradients`.
+    `deviation`. The flag and the last arguments are those of `conjugate_gradients`.
     """
     count = len(curvature)
     # The step s minimises s (A + p) s - 2 s (g - p x0), with the curvature A and gradient g of the
@@ -516,8 +515,7 @@ def conjugate_gradients(
 
     `product` gives A x with a positive definite A, `precondition` B^-1 x with an approximation B to
     A, and `gradient` g is (n,). The iteration is the last whose decrease is below `enough`, or
-    below the part `sufficient` of the whole decrease. SciPy's `cg` ends by the size of the
-    gradient, which says little where unknowns are nearly degenerate.
+    below the part `sufficient` of the whole decrease.
     """
     # Along a direction p, with the remaining gradient r = g - A x and z = B^-1 r, the minimum is at
     # the length (r . z) / (p . A p) and lowers the function by (r . z)^2 / (p . A p), since r is
@@ -540,6 +538,8 @@ def conjugate_gradients(
         remaining -= power / curvature * pulled
         decrease = power**2 / curvature
         total += decrease
+        # SciPy's `cg` ends by the size of the gradient, which says little where unknowns are nearly
+        # degenerate.
         if decrease < max(sufficient * total, enough):
             return x, True
         ahead = precondition(remaining)
