@@ -164,6 +164,7 @@ def candidate_table(
     contrast = candidates.contrasts.numpy()
     factors = factor.of(candidates.offsets)
     error = factors * candidates.errors.numpy()[:, 0]
+    # Of the covariance of all candidates, each one's own part by contrast, x and y.
     covariance = candidates.covariance.numpy().reshape(3, count, 3, count)
     positions = Positions(
         candidates.offsets.numpy(),
@@ -203,6 +204,7 @@ def measured_table(raw: QTable, calibration: Image, sky: Sky, sigmas: float) -> 
     positions = Positions(offsets, np.zeros((len(raw), 2, 2)), sky.north or 0.0)
     contrast, snr = (np.asarray(raw[name]) for name in ("contrast", "snr"))
     contrast_error = np.array(raw["contrast_error"])
+    # The S/N is without calibration errors, and so is this error.
     error = np.divide(contrast, snr, out=contrast_error.copy(), where=snr != 0)
     limit = np.maximum(contrast, 0) + sigmas * contrast_error
     limit = np.where(snr < sigmas, limit, np.nan)
