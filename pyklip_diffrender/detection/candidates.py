@@ -56,34 +56,23 @@ its images are used again; the fit ends when all steps are shorter."""
 
 @dataclass(frozen=True)
 class Candidates:
-    """Point sources fitted together.
+    """Point sources fitted together."""
 
-    Attributes
-    ----------
-    offsets : Tensor, (k, 2)
-        x, y from the star, arcsec.
-    contrasts : Tensor, (k,)
-    covariance : Tensor, (3 k, 3 k)
-        Of all contrasts, then all x, then all y, with the star marginalised; 0 where not known.
-    detection_errors : Tensor, (k,)
-        Standard deviations of the contrasts for known positions, as in a map of S/N; 0 where not
-        known. Those in `covariance` include what the uncertain positions add.
-    converged : bool
-    """
-
-    offsets: Tensor
-    contrasts: Tensor
+    offsets: Tensor  # (k, 2), x, y from the star, arcsec.
+    contrasts: Tensor  # (k,).
+    # (3 k, 3 k), of all contrasts, then all x, then all y, with the star marginalised; 0 where not
+    # known.
     covariance: Tensor
+    # (k,), standard deviations of the contrasts for known positions, as in a map of S/N; 0 where
+    # not known. Those in `covariance` include what the uncertain positions add.
     detection_errors: Tensor
     converged: bool = True
 
     def snr(self, factor: ErrorFactor) -> Image:
-        """S/N of the candidates, (k,), with their errors multiplied by the factor.
-
-        Its square is the difference in chi-squared that a candidate makes. It is what a map of S/N
-        shows at the fitted position, so that thresholds and false-alarm probabilities of the map's
-        maximum apply.
-        """
+        """S/N of the candidates, (k,), with their errors multiplied by the factor."""
+        # Its square is the difference in chi-squared that a candidate makes. It is what a map of
+        # S/N shows at the fitted position, so that thresholds and false-alarm probabilities of the
+        # map's maximum apply.
         errors = self.detection_errors.numpy() * factor.of(self.offsets)
         return np.asarray(self.contrasts.numpy() / errors)
 
@@ -142,24 +131,21 @@ class Candidates:
 def refine_candidates(
     groups: Sequence[Group], candidates: Candidates, reach: float, iterations: int = _ITERATIONS
 ) -> Candidates:
-    """Fit contrasts and positions of all candidates together.
+    """Fit contrasts and positions of all candidates together, with the star marginalised.
 
-    Gauss-Newton steps with the star marginalised.
-
-    Parameters
-    ----------
-    groups : sequence of (LinearModel, Templates)
-    candidates : Candidates
-        Starting values.
-    reach : float
-        Longest step of a position, arcsec.
-    iterations : int
-        Largest number of steps.
+    `reach` is the longest step of a position, arcsec.
     """
     if not len(candidates):
         return candidates
     count = len(candidates)
     offsets, contrasts = candidates.offsets.clone(), candidates.contrasts.clone()
+    # Gauss-Newton steps. With the images p_j and contrasts c_j of the sources, the columns B are
+    # p_j, c_j dp_j/dx and c_j dp_j/dy, and a step is
+    #
+    #     (B Sigma^-1 B^T)^-1 B Sigma^-1 (r - sum_j c_j p_j)
+    #
+    # with both products summed over the groups. The inverse of the part by contrasts alone has the
+    # errors for known positions.
     identity = torch.eye(3 * count, dtype=torch.float64)
     covariance, converged = identity, False
     detection_errors = torch.ones(count, dtype=torch.float64)
@@ -213,21 +199,7 @@ _PLACES = 4
 
 
 class Maps:
-    """Inner products with a planet p at every pixel of the first frame.
-
-    Parameters
-    ----------
-    groups : sequence of (LinearModel, Templates)
-    progress : bool
-        Show progress bars.
-
-    Attributes
-    ----------
-    numerator, information, photon : ndarray, (ny, nx)
-        p . Sigma^-1 r, p . Sigma^-1 p and p . p, see `linear.model.TemplateProducts`.
-    starlight : ndarray, (ny, nx)
-        Star over noise, averaged over the pixels with the squared S/N that a planet has in each.
-    """
+    """Inner products with a planet at every pixel of the first frame, of groups of fits."""
 
     def __init__(self, groups: Sequence[Group], progress: bool = False) -> None:
         self.groups, self.progress = tuple(groups), progress
@@ -249,6 +221,8 @@ class Maps:
             light[:, pixels] += self._starlight(g, images)
             between[:, pixels] += _products(cleaned[g], images)
         self._between = between.reshape(-1, ny, nx)
+        # p . Sigma^-1 r, p . Sigma^-1 p and p . C^-1 p, (ny, nx) each, see `TemplateProducts`; and
+        # star over noise, averaged over pixels with the squared S/N that a planet has in each.
         self.numerator, self.information, self.photon = total.reshape(3, ny, nx)
         with np.errstate(invalid="ignore"):
             self.starlight = (light[0] / light[1]).reshape(ny, nx)
@@ -268,6 +242,9 @@ class Maps:
     @cached_property
     def correlation(self) -> Image:
         """Autocorrelation of the S/N of noise, by distance in pixels, mean over the field."""
+        # The covariance of the numerators of planets p and p' is p . Sigma^-1 p', so that the S/N
+        # of noise has the correlation p . Sigma^-1 p' / sqrt(I I') with the information I. It is
+        # averaged over a few places p.
         side = 2 * _REACH + 1
         total, count = np.zeros((2, side, side))
         # Behind the mask the information is 0, and by rounding may be below it.
@@ -314,21 +291,12 @@ class Maps:
     def response(self, offsets: Tensor) -> Image:
         """Change of the numerator by a planet of contrast 1 at each position, (k, ny, nx).
 
-        Parameters
-        ----------
-        offsets : Tensor, (k, 2), float64
-            x, y from the star, arcsec.
+        `offsets` (k, 2), float64, are x, y from the star, arcsec.
         """
         return self.change([templates.at(offsets) for _, templates in self.groups])
 
     def change(self, light: Sequence[Mapping[int, Tensor]]) -> Image:
-        """Change of the numerator by images that are added to the data, (k, ny, nx).
-
-        Parameters
-        ----------
-        light : sequence of mapping of int to Tensor, (k, ny, nx)
-            Images by frame, for each group.
-        """
+        """Change of the numerator, (k, ny, nx), by images, (k, ny, nx) by frame for each group."""
         cleaned = self._cleaned(light)
         ny, nx = self.shape
         total = np.zeros((len(cleaned[0][0]), ny * nx))
@@ -373,13 +341,7 @@ def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool
     """Return True if the companions of a fit of the target are not the candidates.
 
     They are if every companion is at the place of one candidate and about as bright, and the other
-    way round.
-
-    Parameters
-    ----------
-    fits : sequence of Refinement
-    candidates : Candidates
-        Positions refer to the first frame of the first fit.
+    way round. Positions of candidates refer to the first frame of the first fit.
     """
     return any(
         len(fit.companions) != len(candidates) or bool((~_confirmed(fit, fits, candidates)).any())
@@ -389,16 +351,10 @@ def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool
 
 
 def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
-    """Which sources are companions whose light counts in the derivatives of a fit, (k,).
+    """Which sources (k, 2), x, y from the star, have light in the derivatives of the fit, (k,).
 
     Errors of such a source from the linear model contain those of the star and of the source's
     image already.
-
-    Parameters
-    ----------
-    templates : Templates
-    offsets : Tensor, (k, 2)
-        x, y of the sources from the star, arcsec.
     """
     fit = templates.fit
     first = fit.frames[0].observation
@@ -410,20 +366,10 @@ def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
 def unconfirmed_companions(
     fits: Sequence[Refinement], candidates: Candidates
 ) -> NDArray[np.float64]:
-    """Companions of the fits of the target that are none of the candidates.
+    """Companions of the fits of the target that are none of the candidates, (k, 3).
 
-    They are most often errors of the star, which was fitted together with them.
-
-    Parameters
-    ----------
-    fits : sequence of Refinement
-    candidates : Candidates
-        Positions refer to the first frame of the first fit.
-
-    Returns
-    -------
-    ndarray, (k, 3)
-        Contrast, and x and y from the star in the first frame of their fit, arcsec.
+    Contrast, and x and y from the star in the first frame of their fit, arcsec; candidates'
+    positions refer to the first frame of the first fit.
     """
     parts = [
         fit.companions[~_confirmed(fit, fits, candidates)]
@@ -459,18 +405,11 @@ def with_companions(
 ) -> list[Refinement]:
     """Refine all fits of the target again, with the candidates as companions of the star.
 
-    Without parameters of its own, a bright companion biases the fitted wavefront beyond the range
-    of the linear model.
-
-    Parameters
-    ----------
-    fits : sequence of Refinement
-    candidates : Candidates
-        Positions refer to the first frame of the first fit.
-    progress : bool
-        Show progress bars.
+    Positions of candidates refer to the first frame of the first fit.
     """
     origin = fits[0].frames[0].observation
+    # Without parameters of its own, a bright companion biases the fitted wavefront beyond the range
+    # of the linear model.
     refined = []
     for fit in fits:
         if not has_only_reference_stars(fit):
@@ -485,17 +424,10 @@ def with_companions(
 def without_light(
     fit: Refinement, light: Mapping[int, Image], original: Sequence[Observation] | None = None
 ) -> Refinement:
-    """Refine the star again after light is subtracted from the data, without companions.
+    """Refine the star again after light, (ny, nx) by frame, is subtracted, without companions.
 
-    The errors of the data still contain the photon noise of that light.
-
-    Parameters
-    ----------
-    fit : Refinement
-    light : mapping of int to ndarray, (ny, nx)
-        By frame.
-    original : sequence of Observation, optional
-        The frames from which it is subtracted; default those of the fit.
+    It is subtracted from `original`, by default the frames of the fit. The errors of the data still
+    contain its photon noise.
     """
     observations = original or [frame.observation for frame in fit.frames]
     frames = [
@@ -525,25 +457,15 @@ def with_position_of_star(
 ) -> Candidates:
     """Add the error of the star's position to the covariance of candidates' positions.
 
-    The star's unknowns and the noise in the candidates' pixels are taken as independent. Errors of
-    a companion whose light counts in the derivatives by the star's unknowns contain that of the
-    star already, and do not change.
-
-    Parameters
-    ----------
-    groups : sequence of (LinearModel, Templates)
-    candidates : Candidates
-    place : Tensor, (2,), optional
-        x, y from the star, arcsec, at which displacements are computed for all candidates. Default
-        their own positions, which must be on the frames.
-
-    Returns
-    -------
-    Candidates
+    It is computed at the candidates, which must be on the frames, or for all of them at `place`
+    (2,), x, y from the star, arcsec.
     """
     count = len(candidates)
     if not count:
         return candidates
+    # The star's unknowns and the noise in the candidates' pixels are taken as independent. Errors
+    # of a companion whose light counts in the derivatives by the star's unknowns contain that of
+    # the star already, and do not change.
     places = candidates.offsets if place is None else place[None]
     rates = [_rates(groups, each) for each in places]
     covariance = candidates.covariance.clone()
@@ -627,32 +549,20 @@ def candidate_errors(
 def calibration_errors(
     groups: Sequence[Group], offsets: Tensor, snr: Tensor, factors: Tensor
 ) -> Tensor:
-    """Relative errors of contrasts because of the star's flux and of the source's image.
+    """Relative errors of contrasts by the star's flux and by the source's image, (2, k), float64.
 
-    A contrast is the flux of the source over that of the star. The source is measured with an
-    image that depends on the wavefront, so errors of the wavefront and of the star's flux change
-    the contrast in proportion. They do not change the significance of a source. Both come from
-    the same posterior and may partly cancel. In real frames the posterior understates the error of
-    the star's flux, see `star_flux_error`, which is added. Errors of a companion whose light counts
-    in the derivatives by the star's unknowns contain the posterior's already; only this is added.
-
-    Parameters
-    ----------
-    groups : sequence of (LinearModel, Templates)
-    offsets : Tensor, (k, 2)
-        x, y of the sources from the star, arcsec.
-    snr : Tensor, (k,)
-        S/N of the sources. Below 25 the image is taken as known, because noise dominates.
-    factors : Tensor, (k,)
-        By which errors of the posterior are multiplied.
-
-    Returns
-    -------
-    Tensor, (2, k), float64
-        Relative errors of the contrasts, and of the sources' own fluxes, which do not depend on the
-        star's.
+    The second row is of the sources' own fluxes, which do not depend on the star's. `offsets`
+    (k, 2) are x, y from the star, arcsec; `snr` and the factors of the posterior's errors are (k,).
+    Below a S/N of 25 the image is taken as known, because noise dominates.
     """
     count = len(offsets)
+    # A contrast is the flux of the source over that of the star. The source is measured with an
+    # image that depends on the wavefront, so errors of the wavefront and of the star's flux change
+    # the contrast in proportion. They do not change the significance of a source. Both come from
+    # the same posterior and may partly cancel. In real frames the posterior understates the error
+    # of the star's flux, see `star_flux_error`, which is added. Errors of a companion whose light
+    # counts in the derivatives by the star's unknowns contain the posterior's already; only this is
+    # added.
     frames = sum(len(templates.frames) for _, templates in groups)
     variance = torch.zeros(2 * count, dtype=torch.float64)
     for linear, templates in groups:
@@ -684,6 +594,8 @@ def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) 
     model, basis = templates.frames[k].model, templates.fit.basis
     grid = PupilGrid.full(model.npix, model.diameter)
     image = templates.image(k, offset, basis.opd(modes * NANOMETRE, grid))
+    # A matched filter with the image m measures the flux (m . W m') / (m . W m) of a source whose
+    # image is m'; its derivative is taken at m' = m.
     weighted = image.detach() * frame.weight.to(image.device) ** 2
     share = (weighted * image).sum() / (weighted * image.detach()).sum()
     return torch.autograd.grad(share, modes)[0]
@@ -746,39 +658,17 @@ _STEPS = 6
 
 
 class ReferenceSource(NamedTuple):
-    """A point source beside a reference star, in one frame.
+    """A point source beside a reference star, in one frame."""
 
-    Attributes
-    ----------
-    contrast : float
-        To its star.
-    offset : tuple of float
-        x, y from the star, arcsec.
-    light : ndarray, (ny, nx)
-        Its image, in the unit of the frame.
-    """
-
-    contrast: float
-    offset: tuple[float, float]
-    light: NDArray[np.float64]
+    contrast: float  # To its star.
+    offset: tuple[float, float]  # x, y from the star, arcsec.
+    light: NDArray[np.float64]  # (ny, nx), in the unit of the frame.
 
 
 def sources_of_references(fit: Refinement) -> dict[int, ReferenceSource]:
-    """Find the most significant point source beside each reference star of a fit.
-
-    A source beside a reference star leaves a dark spot in the residual of the target, at the same
-    pixels of the detector.
-
-    Parameters
-    ----------
-    fit : Refinement
-        Of target and reference stars together.
-
-    Returns
-    -------
-    dict of int to ReferenceSource
-        By the frame's place in the fit, for all frames of the stars that have one.
-    """
+    """Find the most significant point source beside each reference star, by place in the fit."""
+    # A source beside a reference star leaves a dark spot in the residual of the target, at the same
+    # pixels of the detector.
     stars: dict[str, list[int]] = {}
     for k, frame in enumerate(fit.frames):
         if frame.observation.reference:
@@ -840,12 +730,11 @@ def _templates_of(fit: Refinement, places: Sequence[int]) -> Templates:
 def _approximate_snr(
     fit: Refinement, places: Sequence[int], rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """S/N of sources at pixels of the first frame of a star, (k,), in units of its scatter.
-
-    With the residual r of all unknowns, p . Sigma^-1 r is exact, and p . C^-1 p takes the place of
-    p . Sigma^-1 p, which differs from it by a factor that varies slowly over the field. Dithers
-    move the star by a fraction of a pixel, so that templates of the first frame do for all.
-    """
+    """S/N of sources at pixels of the first frame of a star, (k,), in units of its scatter."""
+    # With the residual r of all unknowns, p . Sigma^-1 r is exact, and p . C^-1 p takes the place
+    # of p . Sigma^-1 p, which differs from it by a factor that varies slowly over the field.
+    # Dithers move the star by a fraction of a pixel, so that templates of the first frame do for
+    # all.
     linear, first = fit.star_only, places[0]
     templates = _templates_of(fit, [first])
     cleaned = torch.zeros_like(linear.cleaned[first])

@@ -58,40 +58,18 @@ _STEP = 0.1
 
 @dataclass(frozen=True, eq=False)
 class CombinedSource:
-    """One candidate of a search over filters and epochs.
+    """One candidate of a search over filters and epochs."""
 
-    Attributes
-    ----------
-    place : ndarray, (2,)
-        East and north of the star at the epoch `mjd`, arcsec.
-    covariance : ndarray, (2, 2)
-        Of the place, arcsec^2.
-    mjd : float
-    search : str
-        In which it is most significant.
-    sigmas : float
-        Significance in Gaussian standard deviations, before trials.
-    false_alarm : float
-    spectrum : str
-    snr : float
-        With that spectrum.
-    chi2 : float
-        Of the fluxes about the best listed spectrum; NaN without one.
-    fluxes : SkyStack
-        At the place, (filters,).
-    hypotheses : Hypotheses or None
-    """
-
-    place: Image
-    covariance: Image
+    place: Image  # (2,), east and north of the star at the epoch `mjd`, arcsec.
+    covariance: Image  # (2, 2), of the place, arcsec^2.
     mjd: float
-    search: str
-    sigmas: float
+    search: str  # In which it is most significant.
+    sigmas: float  # Significance in Gaussian standard deviations, before trials.
     false_alarm: float
     spectrum: str
-    snr: float
-    chi2: float
-    fluxes: SkyStack
+    snr: float  # With that spectrum.
+    chi2: float  # Of the fluxes about the best listed spectrum; NaN without one.
+    fluxes: SkyStack  # At the place, (filters,).
     hypotheses: Hypotheses | None
 
 
@@ -277,17 +255,8 @@ def candidates_table(
 ) -> QTable:
     """Make the table of candidates; see `Combination.candidates`.
 
-    Parameters
-    ----------
-    sources : sequence of CombinedSource
-    filters : sequence of str
-        Of their fluxes.
-    stars : mapping of str to float
-        Flux of the star by filter, in the unit of the fluxes.
-    jansky : bool
-        Whether that is Jy, or the fluxes are contrasts.
-    dated : bool
-        Whether the epoch is known.
+    `filters` are those of their fluxes, and `stars` has the flux of the star by filter, in their
+    unit: Jy, or contrast if `jansky` is False. `dated` says whether the epoch is known.
     """
     count = len(sources)
     places = np.array([each.place for each in sources]).reshape(-1, 2)
@@ -376,21 +345,10 @@ def limits_table(
     level: float,
     inner: float,
 ) -> QTable:
-    """Make the table of limits; see `Combination.limits`.
+    """Make the table of limits at the threshold `level`; see `Combination.limits`.
 
-    Parameters
-    ----------
-    stack : SkyStack
-        At the pixels of the grid.
-    spectra : PlanetSpectra
-    stars : mapping of str to float
-        Flux of the star by filter, in the unit of the stack.
-    grid : ndarray, (ny, nx, 2)
-        East and north, arcsec.
-    level : float
-        Threshold.
-    inner : float
-        Smallest separation, arcsec.
+    The stack is at the pixels of `grid` (ny, nx, 2), east and north, arcsec; `stars` has the flux
+    of the star by filter in its unit, and `inner` is the smallest separation, arcsec.
     """
     distance = separation_of(grid)
     errors = stack.amplitude_errors(spectra.flux)
@@ -400,6 +358,9 @@ def limits_table(
     half_width = abs(float(grid[1, 1, 1] - grid[0, 0, 1])) / 2
     rows = []
     for k, name in enumerate(spectra.names):
+        # At the threshold the amplitude of a spectrum s is `level` times its error, and the flux in
+        # filter f is that amplitude times s_f. Contrasts are stated for the filter with the most
+        # weight.
         f = int(np.argmax(weights[k][:, known].mean(axis=1)))
         for separation in np.arange(inner, edge, _STEP):
             ring = (np.abs(distance - separation) <= half_width) & np.isfinite(errors[k])

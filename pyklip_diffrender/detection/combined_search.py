@@ -8,7 +8,7 @@ unknowns of the star marginalised. Different fits share no unknowns, so a source
 
 where F_f and e_f are the flux density in a filter and its error: those of the joint likelihood of
 all frames. The spectrum is not known, and the highest S/N of a family of spectra has more trials
-than that of one, see `trials`. In what follows, places are offsets from the star to the east and to
+than that of one, see `Family`. In what follows, places are offsets from the star to the east and to
 the north, arcsec.
 """
 
@@ -203,25 +203,15 @@ def combine(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """One way to add maps: an epoch alone, or all with the motion of a hypothesis.
-
-    Attributes
-    ----------
-    name : str
-    maps : tuple of SkyMap
-    moves : tuple of dict
-        Offsets, (2,), by the name of the map; several for different orbital motions.
-    speeds : tuple of float
-        Largest part of `moves` that is orbital, arcsec per year, which limits the separation.
-    reference : float
-        Epoch of the places, MJD.
-    """
+    """One way to add maps: an epoch alone, or all with the motion of a hypothesis."""
 
     name: str
     maps: tuple[SkyMap, ...]
+    # Offsets, (2,), by the name of the map; several for different orbital motions.
     moves: tuple[dict[str, Image], ...]
+    # Largest part of `moves` that is orbital, arcsec per year, which limits the separation.
     speeds: tuple[float, ...]
-    reference: float
+    reference: float  # Epoch of the places, MJD.
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,6 +321,8 @@ class _Searcher:
     def _velocities(self, days: float) -> list[Image]:
         """Orbital motions, (2,) each, arcsec per year, half lambda/D apart at the last epoch."""
         motion, years = self.motion, days / YEAR
+        # Velocities on a square lattice within the speed of a parabolic orbit at the inner
+        # separation.
         fastest = 0.0 if motion is None else math.sqrt(2) * float(motion.orbital(self.inner))
         step = self.resolution / 2 / years
         reach = int(fastest / step)
@@ -384,6 +376,10 @@ class _Searcher:
                 for name, spectra in self._families(stack).items():
                     family = Family(spectra, stack[used], self.area)
                     members.setdefault(name, []).append((move, family, used))
+        # All searches and families share the false alarms of a single search equally: the level is
+        # that at which noise has so many maxima over all motions of this search, with spectra of
+        # this family. A peak anywhere else would have counted as well, so that its probability is
+        # multiplied by the trials.
         trials = len(self.searches) * len(members)
         peaks = []
         for name, parts in members.items():
@@ -427,6 +423,8 @@ class _Searcher:
         best, snr, chi2 = FREE, 0.0, math.nan
         shape = np.maximum(fluxes.flux, 0.0)
         if len(self.spectra.names):
+            # With S/N z_f in the filters and the direction w of a spectrum, the S/N of the spectrum
+            # is w . z, and chi-squared of the fluxes about it is |z|^2 - (w . z)^2.
             values = fluxes.weights(self.spectra.flux) @ fluxes.snr
             k = int(np.argmax(values))
             chi2 = float((fluxes.snr**2).sum() - values[k] ** 2)
@@ -434,6 +432,8 @@ class _Searcher:
                 best, snr, shape = self.spectra.names[k], float(values[k]), self.spectra.flux[k]
         if best == FREE:
             snr = float(np.sqrt((np.maximum(fluxes.snr, 0) ** 2).sum()))
+        # The chi-squared of a peak of S/N z in noise of curvature L grows by z^2 d L d at the
+        # distance d.
         share = fluxes.snr**2 / max(float((fluxes.snr**2).sum()), 1e-300)
         curvature = max(snr, 1.0) ** 2 * np.einsum("f,fij->ij", share, fluxes.curvature)
         return CombinedSource(

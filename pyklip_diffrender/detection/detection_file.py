@@ -231,10 +231,7 @@ def _hdus_of(detection: Any) -> fits.HDUList:
 def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     """Return the maps, the error factor and the grid of a detection, by attribute.
 
-    Raises
-    ------
-    KeyError, ValueError
-        If an extension is missing, or if not all images have the same shape.
+    Raises `KeyError` if an extension is missing, `ValueError` if the images differ in shape.
     """
     maps: dict[str, Any] = {attribute: image(hdus, name, 0) for name, attribute in _MAPS.items()}
     maps["grid"] = np.stack([image(hdus, "OFFSET_X", 0), image(hdus, "OFFSET_Y", 0)], axis=-1)
@@ -250,13 +247,7 @@ def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
 
 
 def _searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a detection that do not need its fits.
-
-    Raises
-    ------
-    KeyError, ValueError
-        If a part is missing, or if not all images have the same shape.
-    """
+    """Return the fields of a detection that do not need its fits; raises as `_maps_of`."""
     return {
         "threshold": facts["threshold"],
         "sources": _candidates_of(facts["candidates"]),
@@ -359,12 +350,8 @@ def read_detection(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a file of `write_detection`; see `Detection.read`.
 
-    Returns
-    -------
-    fields : dict
-        Those of the class.
-    computed : dict
-        Cached properties that a new detection computes from its fits, by name.
+    Returns the fields of the class, and the cached properties that a new detection computes from
+    its fits, by name.
     """
     path = path / "detection.fits" if path.is_dir() else path
     searched = (fit,) if isinstance(fit, Refinement) else tuple(fit or ())
@@ -377,31 +364,19 @@ def read_detection(
 def searched_fits(
     path: Path, digests: Sequence[str]
 ) -> tuple[tuple[Refinement, ...], tuple[Group, ...]]:
-    """Fits in the folder of a detection, with their linear models and templates.
+    """Fits in the folder of a detection's file, with their linear models and templates.
 
-    Parameters
-    ----------
-    path : Path
-        File of the detection.
-    digests : sequence of str
-        See `digest`.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If there is no fit with a linear model, or another one.
+    Raises `IncompatibleSetupError` if there is no fit with a linear model, or one of another
+    `digest`.
     """
     fits = (_fit_beside(path),)
     return fits, _groups_of(fits, digests, path)
 
 
 def _fit_beside(path: Path) -> Refinement:
-    """Read the fit that was written to the folder of a detection.
+    """Read the fit that was written to the folder of a detection's file.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        If there is none.
+    Raises `IncompatibleSetupError` if there is none, or none with its linear model.
     """
     file = path.with_name("fit.fits")
     if not file.is_file():

@@ -98,30 +98,9 @@ _LIMIT = 5.0
 class ConnectedLight:
     """Brightness of sources, smoothed and opened by lines.
 
-    Parameters
-    ----------
-    snr : ndarray, (ny, nx)
-        Light of the source on each pixel over its standard deviation if it were alone.
-    resolution : float
-        lambda/D, pixels.
-
-    Attributes
-    ----------
-    smoothed : ndarray, (ny, nx)
-        In a beam that keeps the peak of a point source.
-    opened : ndarray, (ny, nx)
-
-    Examples
-    --------
-    A line is extended light, a point source beside it is not:
-
-    >>> import numpy as np
-    >>> from pyklip_diffrender.detection.disk import ConnectedLight
-    >>> snr = np.zeros((32, 32))
-    >>> snr[8, 4:28] = snr[20, 16] = 20.0
-    >>> is_extended = ConnectedLight(snr, resolution=2.3).is_extended
-    >>> bool(is_extended[8, 16]), bool(is_extended[20, 16])
-    (True, False)
+    `snr` (ny, nx) is the light of the source on each pixel over its standard deviation if it were
+    alone, and `resolution` lambda/D in pixels. `smoothed` and `opened` have its shape; the beam
+    keeps the peak of a point source.
     """
 
     def __init__(self, snr: Image, resolution: float) -> None:
@@ -132,6 +111,9 @@ class ConnectedLight:
 
     def _opening(self, peak: float = 0.0) -> Image:
         """The opening at every pixel with a point source added there, (ny, nx)."""
+        # For every direction, lines of 2 `half` + 1 pixels that contain the pixel: the largest of
+        # their smallest values. The profile reaches two half lines to each side, so that it holds
+        # all of them.
         half = max(1, round(_HALF_LINE * self.resolution))
         along = np.arange(-2 * half, 2 * half + 1)
         source = peak * np.exp(-4 * np.log(2) * (along / self.resolution) ** 2)
@@ -486,17 +468,8 @@ def _extended(
 ) -> tuple[Refinement, _Sources] | None:
     """The star without extended light, and the sources of that light; None if there is none.
 
-    Parameters
-    ----------
-    fit : Refinement
-        The star together with all light.
-    sources : _Sources
-        Of all light.
-    inner : float
-        arcsec.
-    original : sequence of Observation
-        The frames of the fit.
-    bar : ProgressBar
+    `fit` and `sources` are of the star together with all light, `inner` is in arcsec, and
+    `original` are the frames of the fit.
     """
     bar.update(sources=len(sources))
     fit = without_light(fit, sources.light, original)
@@ -518,30 +491,15 @@ def _extended(
 
 @dataclass(frozen=True, eq=False)
 class _Sources:
-    """Non-negative sources on a grid.
-
-    Attributes
-    ----------
-    templates : Templates
-    pixels : tuple of ndarray, (k,)
-        Rows and columns.
-    contrasts : ndarray, (k,)
-    errors : ndarray, (k,)
-        Standard deviations of the contrasts, each source alone.
-    flux : float
-        Flux of the star, to which contrasts are relative.
-    light : dict of int to ndarray, (ny, nx)
-        By frame.
-    gain : float
-        Decrease of chi-squared with respect to earlier sources on the same pixels, if any.
-    """
+    """Non-negative sources on a grid."""
 
     templates: Templates
-    pixels: Pixels
-    contrasts: Image
-    errors: Image
-    flux: float
-    light: dict[int, Image]
+    pixels: Pixels  # Rows and columns, (k,) each.
+    contrasts: Image  # (k,).
+    errors: Image  # (k,), standard deviations of the contrasts, each source alone.
+    flux: float  # Flux of the star, to which contrasts are relative.
+    light: dict[int, Image]  # (ny, nx) by frame.
+    # Decrease of chi-squared with respect to earlier sources on the same pixels, if any.
     gain: float
 
     def __len__(self) -> int:
@@ -583,6 +541,7 @@ def _fit_sources(
     images = templates.at_pixels(*pixels)
     flux, before = fit.frames[0].flux, np.zeros(len(pixels[0]))
     if start is not None:
+        # The star was fitted without this light, which is added to the data again.
         linear = linear.without("companions", start.light)
         if all(map(np.array_equal, start.pixels, pixels)):
             before = start.contrasts * (start.flux / flux)
@@ -610,6 +569,8 @@ def _positions(grid: Image, inner: float) -> Pixels:
 
 def _brightest(matrix: Image, vector: Image, start: Image, threshold: float = _THRESHOLD) -> Image:
     """The non-negative light that minimises the sum at the top of this module, (k,)."""
+    # In units of each source's standard deviation: x C x / 2 - (g - s) x, with the threshold s and
+    # the slope C x - g + s.
     scale = np.sqrt(matrix.diagonal().clip(min=1e-300))
     curvature, gradient = matrix / scale[:, None] / scale, vector / scale
 

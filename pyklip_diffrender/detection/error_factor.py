@@ -82,30 +82,14 @@ _ANGLES = 72
 
 @dataclass(frozen=True)
 class ErrorFactor:
-    """Factor for errors at any position.
+    """Factor for errors at any position."""
 
-    Attributes
-    ----------
-    factors : ndarray, (ny, nx)
-        At the pixels of the first frame.
-    freedom : ndarray, (ny, nx)
-        Degrees of freedom of Student's t, which noise follows in units of errors that were
-        multiplied by a measured factor. Infinity where the factor is not measured: the noise is
-        then Gaussian.
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-
-    Examples
-    --------
-    >>> from pyklip_diffrender.detection.error_factor import ErrorFactor
-    >>> factor = ErrorFactor.constant(1.5)
-    >>> float(factor.at(0.5)), factor.is_measured
-    (1.5, False)
-    """
-
-    factors: Image
+    factors: Image  # (ny, nx), at the pixels of the first frame.
+    # (ny, nx), degrees of freedom of Student's t, which noise follows in units of errors that were
+    # multiplied by a measured factor. Infinity where the factor is not measured: the noise is then
+    # Gaussian.
     freedom: Image
-    grid: Image
+    grid: Image  # (ny, nx, 2), x, y of the pixels from the star, arcsec.
 
     @classmethod
     def constant(cls, factor: float) -> ErrorFactor:
@@ -188,18 +172,11 @@ def _inverse(values: Image) -> Image:
 class ScatterModel:
     """Logarithm of f^2 at the pixels of a map as a function of a few parameters.
 
-    Parameters have independent Gaussian priors with mean 0 and standard deviation 1.
-
-    Attributes
-    ----------
-    starlight : ndarray, (n,)
-        Star over noise, in units of `_BRIGHT`.
-    rings : ndarray, (n, knots)
-        Derivative of log f^2 by the parameters of g.
+    These have independent Gaussian priors with mean 0 and standard deviation 1.
     """
 
-    starlight: NDArray[np.float64]
-    rings: NDArray[np.float64]
+    starlight: NDArray[np.float64]  # (n,), star over noise, in units of `_BRIGHT`.
+    rings: NDArray[np.float64]  # (n, knots), derivative of log f^2 by the parameters of g.
 
     @classmethod
     def of(cls, starlight: Image, distance: Image, inner: float) -> ScatterModel:
@@ -214,6 +191,8 @@ class ScatterModel:
 
     def evaluate(self, parameters: NDArray[np.float64]) -> tuple[Image, Image]:
         """Return log f^2, (n,), and its derivatives, (n, parameters)."""
+        # A is `quiet` and B q is `bright`: the change of log(A + B q) is the mean of those of log A
+        # and log B, weighted with the two terms.
         quiet = np.exp(_SPREAD * parameters[0])
         bright = np.exp(_STARLIGHT + _STARLIGHT_SPREAD * parameters[1]) * self.starlight
         share = quiet / (quiet + bright)
@@ -229,18 +208,13 @@ class ScatterModel:
         independent: float,
         start: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Most probable parameters and their covariance.
+        """Most probable parameters and their covariance, from squares of the S/N, (n,).
 
-        Fisher scoring for a Gaussian S/N of variance f^2, of which each pixel counts for
-        `independent` positions.
-
-        Parameters
-        ----------
-        squares : ndarray, (n,)
-            Squares of the S/N.
-        independent : float
-        start : ndarray, (parameters,), optional
+        Each pixel counts for `independent` positions.
         """
+        # Fisher scoring. A Gaussian S/N z of variance v = f^2 has the log-likelihood -(log v + z^2
+        # / v) / 2, with the derivative (z^2 / v - 1) / 2 by log v and the information 1 / 2.
+        # Squares are clipped in units of v.
         prior = np.eye(2 + self.rings.shape[1])
         if start is None:
             # From here clipping does not hide a scatter that is large everywhere.
@@ -267,19 +241,10 @@ def _kernel(first: Image, second: Image) -> Image:
 class Scatter:
     """Scatter of the S/N of a map away from sources.
 
-    Parameters
-    ----------
-    starlight : ndarray, (ny, nx)
-        Star over noise, weighted with the image of a planet at the pixel.
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-    inner : float
-        Pixels closer to the star than this are ignored, arcsec.
-    resolution : float
-        Size of a resolution element, arcsec.
-    independent : float
-        Number of independent positions per pixel: one over the sum of the squared autocorrelation
-        of the S/N.
+    `starlight` (ny, nx) is star over noise, weighted with the image of a planet at the pixel, and
+    `grid` (ny, nx, 2) x, y from the star, arcsec. Pixels within `inner` arcsec are ignored;
+    `resolution` is lambda/D, arcsec. `independent` is the number of independent positions per
+    pixel: one over the sum of the squared autocorrelation of the S/N.
     """
 
     def __init__(
@@ -297,13 +262,9 @@ class Scatter:
         self._model = ScatterModel.of(everywhere.ravel(), distance.ravel(), inner)
 
     def factor(self, snr: Image, sources: Tensor | Image) -> ErrorFactor:
-        """Factor for the errors of a map.
+        """Factor for the errors of a map (ny, nx) with sources at x, y, (k, 2).
 
-        Parameters
-        ----------
-        snr : ndarray, (ny, nx)
-        sources : Tensor or ndarray, (k, 2)
-            x, y of sources, which are left out with their surroundings.
+        Sources are left out with their surroundings.
         """
         fit = self._fit(snr, sources)
         if fit is None:
@@ -360,32 +321,16 @@ Peak = tuple[int, int]
 
 @dataclass(frozen=True)
 class Significance:
-    """Errors and thresholds of a map of S/N.
+    """Errors and thresholds of a map of S/N."""
 
-    Attributes
-    ----------
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-    starlight : ndarray, (ny, nx)
-        Star over noise, weighted with the image of a planet at the pixel.
-    correlation : ndarray, (2 k + 1, 2 k + 1)
-        Autocorrelation of the S/N by distance in pixels, 1 in the middle.
-    inner : float
-        Smallest separation of a source, arcsec.
-    resolution : float
-        lambda/D, arcsec.
-    least : float
-        Smallest factor by which errors are multiplied.
-    measured : bool
-        Whether the factor follows the scatter of the map. Otherwise it is `least`.
-    """
-
-    grid: Image
-    starlight: Image
+    grid: Image  # (ny, nx, 2), x, y of the pixels from the star, arcsec.
+    starlight: Image  # (ny, nx), star over noise, weighted with the image of a planet at the pixel.
+    # (2 k + 1, 2 k + 1), autocorrelation of the S/N by distance in pixels, 1 in the middle.
     correlation: Image
-    inner: float
-    resolution: float
-    least: float = 1.0
+    inner: float  # Smallest separation of a source, arcsec.
+    resolution: float  # lambda/D, arcsec.
+    least: float = 1.0  # Smallest factor by which errors are multiplied.
+    # Whether the factor follows the scatter of the map. Otherwise it is `least`.
     measured: bool = True
 
     def factor(self, snr: Image, sources: Tensor | Image) -> ErrorFactor:
@@ -404,16 +349,9 @@ class Significance:
     ) -> Peak | None:
         """Pixel of the highest peak that is significant, judged by the scatter without it.
 
-        Parameters
-        ----------
-        snr : ndarray, (ny, nx)
-            Before errors are multiplied, with the known sources removed.
-        sources : Tensor or ndarray, (k, 2)
-            x, y of the known sources.
-        threshold : float
-            S/N in Gaussian noise; where the scatter is measured, Student's t has it exceeded as
-            rarely.
-        allowed : ndarray of bool, (ny, nx)
+        `snr` (ny, nx) is before errors are multiplied, with the known sources at x, y, (k, 2),
+        removed. `threshold` is that in Gaussian noise; where the scatter is measured, the S/N
+        that Student's t exceeds as rarely takes its place.
         """
         peaks = self.significant_peaks(snr, sources, threshold, allowed)
         return next((peak for peak, _ in peaks), None)
@@ -421,10 +359,9 @@ class Significance:
     def significant_peaks(
         self, snr: Image, sources: Tensor | Image, threshold: float, allowed: NDArray[np.bool_]
     ) -> Iterator[tuple[Peak, float]]:
-        """Peaks that are significant each on its own, and their significance in sigmas.
+        """Peaks that are significant each on its own, and their significance; see `next_peak`.
 
         The significance is the number of standard deviations that Gaussian noise exceeds as rarely.
-        See `next_peak`.
         """
         factor = self.factor(snr, sources)
         # A source raises the scatter by which it is measured: it counts for a position or two.
@@ -450,30 +387,24 @@ class Significance:
         return np.asarray(stats.norm.isf(stats.t.sf(snr, freedom)))
 
     def false_alarms(self, factor: ErrorFactor, snr: Image, offsets: Tensor | Image) -> Image:
-        """Probabilities that noise makes peaks of such S/N anywhere in the field, (k,).
+        """Probabilities, (k,), that noise makes peaks of such S/N anywhere in the field.
 
-        Parameters
-        ----------
-        factor : ErrorFactor
-            By which the errors are multiplied.
-        snr : ndarray, (k,)
-            With multiplied errors.
-        offsets : Tensor or ndarray, (k, 2)
-            x, y, arcsec.
+        `snr` (k,) is with errors multiplied by the factor; `offsets` (k, 2) are x, y, arcsec.
         """
         sigmas = stats.norm.isf(factor.false_alarm(snr, offsets))
         return np.array([self.false_alarm(float(each)) for each in sigmas])
 
     def false_alarm(self, sigmas: float) -> float:
-        """Probability that Gaussian noise exceeds a number of standard deviations anywhere.
-
-        The number of maxima of a smooth field above a high level is nearly its Euler
-        characteristic, whose expectation follows from the area and the edge of the field and the
-        curvature of the autocorrelation: R. J. Adler and J. E. Taylor, "Random Fields and
-        Geometry" (2007), chapter 11.
-        """
+        """Probability that Gaussian noise exceeds a number of standard deviations anywhere."""
         if not math.isfinite(sigmas):
             return 0.0
+        # The number of maxima of a smooth field above a high level u is nearly its Euler
+        # characteristic, whose expectation follows from the area N and the half perimeter of the
+        # field, in pixels, and the curvature L of the autocorrelation (R. J. Adler and J. E.
+        # Taylor, "Random Fields and Geometry", 2007, chapter 11):
+        #
+        #     N sqrt(det L) u exp(-u^2 / 2) / (2 pi)^(3/2)
+        #         + (nx sqrt(L_xx) + ny sqrt(L_yy)) exp(-u^2 / 2) / (2 pi) + P(z > u).
         valid = np.isfinite(self.starlight) & (separation_of(self.grid) >= self.inner)
         # Negative second derivatives of the autocorrelation in the middle, per pixel^2.
         middle = self.correlation.shape[0] // 2
@@ -494,11 +425,10 @@ class Significance:
 
 
 def _derivatives(reach: int) -> tuple[Image, Image]:
-    """Weights of samples -reach, ..., reach whose sums are the derivatives in the middle.
-
-    First and second derivatives of a function without frequencies beyond those of its samples,
-    which is the sum of sinc functions.
-    """
+    """Weights of samples -reach, ..., reach whose sums are the derivatives in the middle."""
+    # First and second derivatives of a function without frequencies beyond those of its samples,
+    # which is the sum of sinc functions sin(pi x) / (pi x): these have the slope (-1)^k / k and the
+    # curvature -2 (-1)^k / k^2 at k, and -pi^2 / 3 in the middle.
     places = np.arange(-reach, reach + 1)
     away = np.where(places == 0, 1, places)
     signs = np.where(places % 2 == 0, 1.0, -1.0)
@@ -534,33 +464,17 @@ def contrast_table(
     factor: ErrorFactor,
     star: float | None = None,
 ) -> QTable:
-    """Make the table of a 5-sigma contrast curve.
+    """Make the table of a 5-sigma contrast curve; separations and lambda/D are in arcsec.
 
-    Parameters
-    ----------
-    separations : ndarray
-        arcsec.
-    errors : list of ndarray
-        Standard deviations of contrasts at the pixels of each ring, multiplied by the factor.
-    photon : list of ndarray
-        Standard deviations for a known star.
-    resolution : float
-        lambda/D, arcsec.
-    factor : ErrorFactor
-    star : float, optional
-        Flux density of the star, Jy.
-
-    Returns
-    -------
-    QTable
-        Separation; median contrast of the ring and its magnitude difference; lowest and highest
-        contrast; the median for a known star (the photon limit of a matched filter); the median
-        with the small-sample correction: where errors were scaled to the scatter of the S/N, noise
-        follows Student's t, with as many degrees of freedom as positions told of the scatter, and
-        exceeds this limit as rarely as Gaussian noise exceeds 5 sigma; the factor; if `star` is
-        known, the flux density of the median.
+    `errors` are standard deviations of contrasts at the pixels of each ring, multiplied by the
+    factor, and `photon` those for a known star. With the star's flux density, Jy, there is a column
+    of that of the median. `_COLUMNS` describes the columns.
     """
     rows = []
+    # Where errors were scaled to the scatter of the S/N, noise follows Student's t, with as many
+    # degrees of freedom as positions told of the scatter. The small-sample limit is the one that it
+    # exceeds as rarely as Gaussian noise exceeds 5 sigma. The limit for a known star is the photon
+    # limit of a matched filter.
     corrections = factor.threshold_at(_SIGMAS, separations) / _SIGMAS
     for separation, error, photon_error, correction in zip(
         separations, errors, photon, corrections, strict=True

@@ -66,12 +66,9 @@ def pixels_of(grid: Image, offsets: Image) -> Image:
 
 
 def require_inside(offsets: Image, grid: Image) -> None:
-    """Raise an exception for positions (k, 2) outside the field.
+    """Raise `IncompatibleSetupError` for positions (k, 2) outside the field.
 
-    Raises
-    ------
-    IncompatibleSetupError
-    NonFiniteError
+    Raises `NonFiniteError` for positions that are not finite.
     """
     require_finite(offsets, "offsets")
     # Pixels have an extent; half a diagonal beyond their centres is still on the detector.
@@ -90,10 +87,7 @@ def require_inside(offsets: Image, grid: Image) -> None:
 def curve_separations(grid: Image, separations: ArrayLike | None) -> Image:
     """Separations of a contrast curve, arcsec; default every 0.1 from 0.2 to the nearest edge.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For a separation that is not positive.
+    Raises `IncompatibleSetupError` for a separation that is not positive.
     """
     if separations is None:
         x, y = np.abs(grid[..., 0]), np.abs(grid[..., 1])
@@ -110,21 +104,9 @@ def curve_separations(grid: Image, separations: ArrayLike | None) -> Image:
 def ring_pixels(
     grid: Image, separations: Image, most: int
 ) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Pixels at several separations, evenly spread in angle.
+    """Rows and columns of at most `most` pixels at each separation, evenly spread in angle.
 
-    Parameters
-    ----------
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-    separations : ndarray
-        arcsec.
-    most : int
-        Largest number of pixels per separation.
-
-    Returns
-    -------
-    list of (rows, columns)
-        Empty where the ring is not on the detector.
+    `grid` (ny, nx, 2) and separations are in arcsec; empty where the ring is not on the detector.
     """
     radius = separation_of(grid)
     angle = np.arctan2(grid[..., 0], grid[..., 1])
@@ -209,21 +191,11 @@ class Sky:
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions relative to the star with their covariances, on the first frame and on the sky.
+    """Positions relative to the star with their covariances, on the first frame and on the sky."""
 
-    Attributes
-    ----------
-    offsets : ndarray, (k, 2)
-        x, y on the first frame, arcsec.
-    covariance : ndarray, (k, 2, 2)
-        Of x and y, arcsec^2.
-    north : float
-        Position angle of +y, degrees east of north.
-    """
-
-    offsets: Image
-    covariance: Image
-    north: float = 0.0
+    offsets: Image  # (k, 2), x, y on the first frame, arcsec.
+    covariance: Image  # (k, 2, 2), of x and y, arcsec^2.
+    north: float = 0.0  # Position angle of +y, degrees east of north.
 
     @property
     def separation(self) -> Image:

@@ -47,16 +47,10 @@ _SETTLED = 0.2
 def contrasts_at(
     groups: Sequence[Group], offsets: ArrayLike, factor: ErrorFactor
 ) -> tuple[QTable, Image]:
-    """Contrasts of point sources at known positions, one at a time; see `Detection.measure`.
+    """Contrasts of point sources at x, y (k, 2), one at a time; see `Detection.measure`.
 
-    All errors are multiplied by the factor of their position.
-
-    Returns
-    -------
-    table : QTable
-        x, y, contrast, contrast_error, snr.
-    calibration : ndarray, (2, k)
-        See `calibration.calibration_errors`.
+    The table has x, y, contrast, contrast_error and snr, with errors multiplied by the factor of
+    their position. The second result is (2, k), see `calibration_errors`.
     """
     places = torch.from_numpy(np.atleast_2d(to_arcsec(offsets, "offsets")))
     if places.ndim != 2 or places.shape[1] != 2:
@@ -99,6 +93,8 @@ def measured_shape(
     total, bright = amplitude, amplitude > relinearise * error
     single_frame = len(fits) == 1 and len(fits[0].frames) == 1
     factor = scatter
+    # Light of a bright source biases the wavefront, and part of it is taken for the star. Without
+    # the light that was found so far, the next amplitude is what is left.
     for _ in range(_ROUNDS if bright and single_frame else 0):
         fit = without_light(fits[0], {0: total * light})
         amplitude, error = _amplitude(fit.star_only, shape)
@@ -161,20 +157,14 @@ def candidate_table(
 ) -> QTable:
     """Make the table of candidates, highest S/N first; see `Detection.candidates`.
 
-    Parameters
-    ----------
-    candidates : Candidates
-    factor : ErrorFactor
-        By which their errors are multiplied.
-    calibration : ndarray, (2, k)
-        Relative calibration errors of their contrasts and of their fluxes; see
-        `calibration.calibration_errors`.
-    sky : Sky
+    `calibration` (2, k) has the relative calibration errors of their contrasts and of their fluxes,
+    and the errors are multiplied by the factor.
     """
     count = len(candidates)
     contrast = candidates.contrasts.numpy()
     factors = factor.of(candidates.offsets)
     error = factors * candidates.errors.numpy()[:, 0]
+    # Of the covariance of all candidates, each one's own part by contrast, x and y.
     covariance = candidates.covariance.numpy().reshape(3, count, 3, count)
     positions = Positions(
         candidates.offsets.numpy(),
@@ -207,20 +197,14 @@ def candidate_table(
 def measured_table(raw: QTable, calibration: Image, sky: Sky, sigmas: float) -> QTable:
     """Complete the table of contrasts at given positions; see `Detection.measure`.
 
-    Parameters
-    ----------
-    raw : QTable
-        See `measurement.contrasts_at`.
-    calibration : ndarray, (2, k)
-        As for `candidate_table`, multiplied by the factor of all errors.
-    sky : Sky
-    sigmas : float
-        S/N of a detection, below which an upper limit is stated.
+    `calibration` (2, k) is as for `candidate_table`, multiplied by the factor of all errors;
+    `sigmas` is the S/N of a detection, below which an upper limit is stated.
     """
     offsets = np.stack([raw["x"].value, raw["y"].value], axis=1)
     positions = Positions(offsets, np.zeros((len(raw), 2, 2)), sky.north or 0.0)
     contrast, snr = (np.asarray(raw[name]) for name in ("contrast", "snr"))
     contrast_error = np.array(raw["contrast_error"])
+    # The S/N is without calibration errors, and so is this error.
     error = np.divide(contrast, snr, out=contrast_error.copy(), where=snr != 0)
     limit = np.maximum(contrast, 0) + sigmas * contrast_error
     limit = np.where(snr < sigmas, limit, np.nan)

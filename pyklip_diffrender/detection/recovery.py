@@ -78,23 +78,13 @@ _UNITS = {"separation": u.arcsec, "position_angle": u.deg}
 
 
 class MeasuredPlanet(NamedTuple):
-    """Measurement of a planet.
+    """Measurement of a planet."""
 
-    Attributes
-    ----------
-    contrast : float
-        Of the candidate within 0.1 arcsec, or else measured at the place of the planet.
-    contrast_error : float
-        Without that of the star's flux.
-    snr : float
-    detected : bool
-        Whether there is such a candidate.
-    """
-
+    # Of the candidate within 0.1 arcsec, or else measured at the place of the planet.
     contrast: float
-    contrast_error: float
+    contrast_error: float  # Without that of the star's flux.
     snr: float
-    detected: bool
+    detected: bool  # Whether there is such a candidate.
 
 
 def recover_planets(
@@ -160,19 +150,9 @@ def recover_planets(
 
 
 def with_planets(frames: Sequence[FrameFit], planets: Sequence[Planet]) -> tuple[Observation, ...]:
-    """Add planets to the data of fitted frames, with the wavefront and the flux of the fit.
+    """Add planets to the data of the target's fitted frames, without their photon noise.
 
-    Parameters
-    ----------
-    frames : sequence of FrameFit
-        Of the target.
-    planets : sequence of Planet
-        Position angles are counted from +y of the first frame.
-
-    Returns
-    -------
-    tuple of Observation
-        Without photon noise of the planets.
+    They have the wavefront and the flux of the fit; position angles are from +y of the first frame.
     """
     science = []
     for frame in frames:
@@ -190,20 +170,10 @@ def with_planets(frames: Sequence[FrameFit], planets: Sequence[Planet]) -> tuple
 def measured_planet(
     detection: Detection, place: tuple[float, float], flux: float
 ) -> MeasuredPlanet:
-    """Measure a planet of which the position is known.
+    """Measure a planet at a known place, x, y from the star in the first frame, arcsec.
 
-    Parameters
-    ----------
-    detection : Detection
-    place : (float, float)
-        x, y from the star in the first frame, arcsec.
-    flux : float
-        Of the star to which the contrast is relative, in the unit of `FrameFit.flux`: of an
-        injected planet, that of the fit with which it was rendered.
-
-    Returns
-    -------
-    MeasuredPlanet
+    `flux` is that of the star to which the contrast is relative, in the unit of `FrameFit.flux`: of
+    an injected planet, that of the fit with which it was rendered.
     """
     sources, factor = detection.sources, detection.error_factor
     unit = detection.fits[0].frames[0].flux / flux

@@ -66,11 +66,9 @@ _DEGENERATE = 1e-6
 
 
 def follows_scatter(fits: Sequence[Refinement]) -> bool:
-    """Whether errors are multiplied by the scatter of the S/N, and not by chi-squared alone.
-
-    On real frames, and where a fit does not explain its data, errors of the model that neighbouring
-    pixels share do not show in chi-squared.
-    """
+    """Whether errors are multiplied by the scatter of the S/N, and not by chi-squared alone."""
+    # On real frames, and where a fit does not explain its data, errors of the model that
+    # neighbouring pixels share do not show in chi-squared.
     explained = all(fit.status.calibrated for fit in fits)
     return not explained or fits[0].frames[0].observation.is_nircam
 
@@ -82,18 +80,9 @@ def significance_of(
     inner: float,
     scatter: float | None = None,
 ) -> Significance:
-    """Errors and thresholds of the S/N maps of fits.
+    """Errors and thresholds of the S/N maps of fits, with sources at x, y, (k, 2), arcsec.
 
-    Parameters
-    ----------
-    fits : sequence of Refinement
-    maps : Maps
-    sources : Tensor, (k, 2)
-        x, y of the known sources, arcsec.
-    inner : float
-        Smallest separation of a source, arcsec.
-    scatter : float, optional
-        Replaces the factor.
+    `inner` is the smallest separation of a source, arcsec; `scatter` replaces the factor.
     """
     return Significance(
         maps.grid,
@@ -120,25 +109,14 @@ def default_factor(
 def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets: Tensor) -> float:
     """Square root of the reduced chi-squared with the light of sources removed, at least 1.
 
-    Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors. Planets
-    are not part of it: one of S/N 20 that is not removed would increase all errors by 3 %.
-    Therefore the sources are fitted together and removed first.
-
-    Parameters
-    ----------
-    fits : sequence of Refinement
-    groups : sequence of (LinearModel, Templates)
-        Of these fits.
-    offsets : Tensor, (k, 2)
-        x, y of the sources from the star, arcsec; some may coincide.
-
-    Returns
-    -------
-    float
-        1 if a fit does not explain its data, because its noise then includes a model error.
+    The sources are at x, y, (k, 2), from the star, arcsec; some may coincide. It is 1 if a fit does
+    not explain its data, because its noise then includes a model error.
     """
     if not all(fit.status.calibrated for fit in fits):
         return 1.0
+    # Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors.
+    # Planets are not part of it: one of S/N 20 that is not removed would increase all errors by
+    # 3 %. Therefore the sources are fitted together and removed first.
     reduced = float(np.mean([fit.reduced_chi2 for fit in fits]))
     companions = Candidates.of_fit(fits[0]).offsets
     # A ratio, because robust fits give outliers less weight in their linear models.
@@ -149,17 +127,8 @@ def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets
 def chi2_by_ring(groups: Sequence[Group], sources: Tensor, factor: ErrorFactor) -> QTable:
     """Chi-squared per pixel of the target's frames in rings about the star, without the sources.
 
-    Parameters
-    ----------
-    groups : sequence of (LinearModel, Templates)
-    sources : Tensor, (k, 2)
-        x, y of the sources, arcsec.
-    factor : ErrorFactor
-
-    Returns
-    -------
-    QTable
-        Inner and outer separation, chi-squared per pixel, and the median error factor.
+    The table has inner and outer separation, arcsec, chi-squared per pixel, and the median error
+    factor; `sources` are x, y, (k, 2), arcsec.
     """
     squares, distances = [], []
     for (linear, templates), residuals in zip(groups, _residuals(groups, sources)[0], strict=True):
@@ -199,6 +168,8 @@ def _residuals(groups: Sequence[Group], offsets: Tensor) -> tuple[list[list[Tens
         linear.normal_equations(part) for (linear, _), part in zip(groups, images, strict=True)
     ]
     matrix, vector = (torch.stack(parts).sum(dim=0) for parts in zip(*equations, strict=True))
+    # Sources that coincide have equal images: the pseudo-inverse shares the light among them, and
+    # the rank of the matrix is the number of unknowns that they are.
     contrasts = torch.linalg.pinv(matrix, rtol=_DEGENERATE, hermitian=True) @ vector
     independent = int(torch.linalg.matrix_rank(matrix, rtol=_DEGENERATE, hermitian=True))
     residuals = []
@@ -224,25 +195,15 @@ def side_lobes(
 ) -> Tensor:
     """Which candidates are not significant beside a source within the inner limit, (k,).
 
-    The source starts at the highest peak there, is fitted together with the candidates, and must be
-    significant beside them. A planet keeps its S/N, because the two images differ.
-
-    Parameters
-    ----------
-    maps : Maps
-    snr : ndarray, (ny, nx)
-        Without the candidates, before errors are multiplied.
-    candidates : Candidates
-    factor : ErrorFactor
-        By which the errors are multiplied.
-    threshold : float
-        S/N of a source in Gaussian noise.
-    inner : float
-        Smallest separation of candidates, arcsec.
+    `snr` (ny, nx) is without the candidates, before errors are multiplied by the factor;
+    `threshold` is that in Gaussian noise, and `inner` the smallest separation of candidates,
+    arcsec.
     """
     none = torch.zeros(len(candidates), dtype=torch.bool)
     if not len(candidates):
         return none
+    # The source starts at the highest peak there, is fitted together with the candidates, and must
+    # be significant beside them. A planet keeps its S/N, because the two images differ.
     scaled = np.where(separation_of(maps.grid) < inner, snr / factor.of(maps.grid), -np.inf)
     peak = np.unravel_index(np.nanargmax(scaled), scaled.shape)
     contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
@@ -289,24 +250,8 @@ def with_raised_peaks(
 ) -> list[Refinement] | None:
     """Refine the star again with the candidates and one of the highest peaks as companions.
 
-    The first one that explains the data ends the search.
-
-    Parameters
-    ----------
-    fits : sequence of Refinement
-    maps : Maps
-        Of these fits.
-    candidates : Candidates
-    inner : float
-        Smallest separation of a peak, arcsec.
-    progress : bool
-        Show progress bars.
-
-    Returns
-    -------
-    list of Refinement or None
-        The fits with the companion that lowers chi-squared most; None if none lowers it enough, or
-        if the fits explain their data.
+    The fits are those with the companion that lowers chi-squared most, or the first that explain
+    the data. None if none lowers it enough, or if the fits explain their data already.
     """
     if not _unexplained(fits):
         return None
@@ -680,47 +625,38 @@ def _checked(fits: Fits) -> list[Refinement]:
 
 @dataclass(frozen=True)
 class _Peaks:
-    """How far a search for peaks has come.
+    """How far a search for peaks has come."""
 
-    Attributes
-    ----------
-    candidates : Candidates
-        In the order in which they were found.
-    dismissed : Tensor, (k, 2)
-        Positions of peaks that were no candidates after all. They would be the highest for ever.
-    within : ndarray of bool, (ny, nx)
-        Pixels whose sources are nearer to the star than the search goes.
-    hides : bool
-        Whether light from there has explained peaks elsewhere.
-    """
-
-    candidates: Candidates
+    candidates: Candidates  # In the order in which they were found.
+    # (k, 2), positions of peaks that were no candidates after all. They would be the highest for
+    # ever.
     dismissed: Tensor
+    # (ny, nx), pixels whose sources are nearer to the star than the search goes.
     within: NDArray[np.bool_]
-    hides: bool = False
+    hides: bool = False  # Whether light from there has explained peaks elsewhere.
+
+
+# Let p be the image of a planet of contrast 1 at a pixel, r the residual of the fit, and Sigma the
+# covariance of noise and starlight with the wavefront marginalised. The maps have
+#
+#     numerator N = p . Sigma^-1 r,    information I = p . Sigma^-1 p
+#
+# for every pixel, so that the contrast is N / I and its S/N is N / sqrt(I) with the errors that the
+# noise explains. Errors are multiplied by a factor f, which grows with the scatter of the S/N.
+# Candidates at offsets o with contrasts c take N = sum c p(o) . Sigma^-1 p from the maps, and with
+# it their side lobes and their share of the scatter. So f falls when a planet becomes a candidate
+# and grows when a candidate is dropped, and a search repeats three steps:
+#
+# 1. `_added`: the highest peak that is left and significant becomes a candidate, and all of them
+#    are fitted together, with their positions.
+# 2. `_dropped`: where no peak is left, the weakest candidate that is not significant with the
+#    present factor is dropped.
+# 3. `_settled`: where none is dropped either, positions are fitted until they move no more.
 
 
 @dataclass(frozen=True)
 class _PeakSearch:
-    """A search of maps for peaks, one after the other, until none is left.
-
-    Let p be the image of a planet of contrast 1 at a pixel, r the residual of the fit, and Sigma
-    the covariance of noise and starlight with the wavefront marginalised. The maps have
-
-        numerator N = p . Sigma^-1 r,    information I = p . Sigma^-1 p
-
-    for every pixel, so that the contrast is N / I and its S/N is N / sqrt(I) with the errors that
-    the noise explains. Errors are multiplied by a factor f, which grows with the scatter of the
-    S/N. Candidates at offsets o with contrasts c take N = sum c p(o) . Sigma^-1 p from the maps,
-    and with it their side lobes and their share of the scatter. So f falls when a planet becomes a
-    candidate and grows when a candidate is dropped, and a search repeats three steps:
-
-    1. `_added`: the highest peak that is left and significant becomes a candidate, and all of them
-       are fitted together, with their positions.
-    2. `_dropped`: where no peak is left, the weakest candidate that is not significant with the
-       present factor is dropped.
-    3. `_settled`: where none is dropped either, positions are fitted until they move no more.
-    """
+    """A search of maps for peaks, one after the other, until none is left."""
 
     maps: Maps
     fits: Sequence[Refinement]
@@ -779,12 +715,10 @@ class _PeakSearch:
         return replace(peaks, candidates=more, within=within)
 
     def _dropped(self, peaks: _Peaks, snr: Image, factor: ErrorFactor) -> _Peaks | None:
-        """Drop the weakest candidate that is none with the present factor; None if all are.
-
-        The factor may have grown since a candidate was accepted. Side lobes of a source within
-        `inner` are no candidates, however significant they are.
-        """
+        """Drop the weakest candidate that is none with the present factor; None if all are."""
         candidates = peaks.candidates
+        # The factor may have grown since a candidate was accepted. Side lobes of a source within
+        # `inner` are no candidates, however significant they are.
         margin = candidates.snr(factor) - factor.threshold(self.threshold, candidates.offsets)
         if not len(candidates) or margin.min() >= 0:
             lobes = side_lobes(self.maps, snr, candidates, factor, self.threshold, self.inner)

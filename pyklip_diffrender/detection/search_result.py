@@ -77,13 +77,7 @@ class _Search(Protocol):
 
 
 def draw_search(axes: Sequence[Any], search: _Search) -> None:
-    """Draw the S/N map with the candidates, and the contrast curve.
-
-    Parameters
-    ----------
-    axes : two Axes
-    search : Detection or WideField
-    """
+    """Draw the S/N map with the candidates, and the contrast curve."""
     table = search.candidates
     drawing.snr_map(
         axes[0], search.snr, search.grid,
@@ -99,17 +93,7 @@ def draw_search(axes: Sequence[Any], search: _Search) -> None:
 def draw_curve(
     ax: Any, search: _Search, klip: QTable | None = None, *, legend_below: bool = False
 ) -> None:
-    """Draw the contrast curve with the candidates.
-
-    Parameters
-    ----------
-    ax : Axes
-    search : Detection or WideField
-    klip : QTable, optional
-        Contrast curve of KLIP on the same frames, see `klip_curve`.
-    legend_below : bool
-        See `drawing.contrast_curve`.
-    """
+    """Draw the contrast curve with the candidates, and KLIP's on the same frames if it is given."""
     drawing.contrast_curve(
         ax, search.contrast_curve, search.candidates, small_sample=search.error_factor.is_measured,
         klip=klip, legend_below=legend_below,

@@ -61,50 +61,23 @@ LIGHT = 1.5
 
 @dataclass(frozen=True, eq=False)
 class SkyMap:
-    """What one reduction says of point sources at every place.
-
-    Attributes
-    ----------
-    name : str
-    filter : str
-    mjd : float or None
-        Epoch.
-    north : float
-        Position angle of the frame's +y axis, degrees east of north.
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star on the frame, arcsec.
-    snr : ndarray, (ny, nx)
-        Contrast over its error; 0 where nothing is known.
-    error : ndarray, (ny, nx)
-        Standard deviation of the contrast; inf where nothing is known.
-    noise : ndarray, (ny, nx)
-        The S/N without the candidates of this reduction.
-    freedom : ndarray, (ny, nx)
-        Degrees of freedom of Student's t, which the S/N of noise follows.
-    resolution : float
-        lambda/D, arcsec.
-    star : float or None
-        Flux density of the star, Jy.
-    threshold : float
-        S/N of a candidate of the single search.
-    fitted : ndarray, (k, 4)
-        East and north of the reduction's own candidates; what is to be added to the contrast of the
-        map there, and by what its error is to be multiplied, so that they are those of all
-        candidates fitted together.
-    """
+    """What one reduction says of point sources at every place."""
 
     name: str
     filter: str
-    mjd: float | None
-    north: float
-    grid: Image
-    snr: Image
-    error: Image
-    noise: Image
-    freedom: Image
-    resolution: float
-    star: float | None = None
-    threshold: float = 5.0
+    mjd: float | None  # Epoch.
+    north: float  # Position angle of the frame's +y axis, degrees east of north.
+    grid: Image  # (ny, nx, 2), x, y of the pixels from the star on the frame, arcsec.
+    snr: Image  # (ny, nx), contrast over its error; 0 where nothing is known.
+    error: Image  # (ny, nx), standard deviation of the contrast; inf where nothing is known.
+    noise: Image  # (ny, nx), the S/N without the candidates of this reduction.
+    freedom: Image  # (ny, nx), degrees of freedom of Student's t, which the S/N of noise follows.
+    resolution: float  # lambda/D, arcsec.
+    star: float | None = None  # Flux density of the star, Jy.
+    threshold: float = 5.0  # S/N of a candidate of the single search.
+    # (k, 4), east and north of the reduction's own candidates; what is to be added to the contrast
+    # of the map there, and by what its error is to be multiplied, so that they are those of all
+    # candidates fitted together.
     fitted: Image = field(default_factory=lambda: np.zeros((0, 4)))
 
     @classmethod
@@ -177,15 +150,7 @@ class SkyMap:
     def at(self, places: Image) -> tuple[Image, Image, Image]:
         """S/N, the same in Gaussian standard deviations, and error of the contrast at places.
 
-        Parameters
-        ----------
-        places : ndarray, (..., 2)
-            East and north of the star, arcsec.
-
-        Returns
-        -------
-        snr, sigmas, error : ndarray, (...)
-            0, 0 and inf outside the map.
+        `places` (..., 2) are east and north of the star, arcsec; results are 0, 0 and inf outside.
         """
         shape = places.shape[:-1]
         columns, rows = pixels_of(self.grid, places.reshape(-1, 2) @ self._turn).T
@@ -218,10 +183,12 @@ class SkyMap:
 
     @cached_property
     def curvature(self) -> NDArray[np.float64]:
-        """Covariance of the gradient of noise of standard deviation 1, (2, 2), per arcsec^2.
-
-        That is the curvature of the autocorrelation, to the east and to the north.
-        """
+        """Covariance of the gradient of noise of standard deviation 1, (2, 2), per arcsec^2."""
+        # That is the curvature of the autocorrelation, to the east and to the north. Slopes are
+        #
+        #     f' = (f(-2 h) - 8 f(-h) + 8 f(h) - f(2 h)) / 12 h,
+        #
+        # and their mean squares are divided by that of the noise.
         spline = spline_filter(self.noise, order=_ORDER)
         used = np.isfinite(self.error) & (np.abs(self.noise) < 4)
         rows, columns = np.nonzero(used)
@@ -250,19 +217,13 @@ class SkyMap:
 
 @dataclass(frozen=True, eq=False)
 class SkyStack:
-    """Flux densities of several reductions at the same places, added by filter.
+    """Flux densities of several reductions at the same places, added by filter."""
 
-    Attributes
-    ----------
-    snr, sigmas, error : ndarray, (filters, ...)
-        As `SkyMap.at`, of the flux in units of `scales`.
-    curvature : ndarray, (filters, 2, 2)
-    """
-
+    # As `SkyMap.at`, (filters, ...) each, of the flux in units of `scales`.
     snr: Image
     sigmas: Image
     error: Image
-    curvature: Image
+    curvature: Image  # (filters, 2, 2), as that of `SkyMap`.
 
     @classmethod
     def of(
@@ -283,6 +244,7 @@ class SkyStack:
         information, snr, sigmas = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         curvature = np.zeros((len(filters), 2, 2))
         for each in maps:
+            # The mean flux with weights 1 / e^2 has the S/N sum(S/N_k / e_k) / sqrt(sum 1 / e_k^2).
             k = filters.index(each.filter)
             moved = places + moves[each.name]
             own_snr, own_sigmas, error = each.fitted_at(moved) if fitted else each.at(moved)
@@ -372,24 +334,13 @@ _SAMPLES = 600
 
 @dataclass(frozen=True)
 class Motion:
-    """How places of sources move between epochs.
+    """How places of sources move between epochs."""
 
-    Attributes
-    ----------
-    proper : (float, float)
-        Proper motion of the star to the east and north, arcsec per year.
-    parallax : float
-        arcsec; 0 if it is not known.
-    coordinates : (float, float) or None
-        Right ascension and declination of the star, degrees.
-    mass : float
-        Of the star, in solar masses.
-    """
-
-    proper: tuple[float, float]
-    parallax: float = 0.0
+    proper: tuple[float, float]  # Proper motion of the star to the east and north, arcsec per year.
+    parallax: float = 0.0  # arcsec; 0 if it is not known.
+    # Right ascension and declination of the star, degrees.
     coordinates: tuple[float, float] | None = None
-    mass: float = 1.0
+    mass: float = 1.0  # Of the star, in solar masses.
 
     def background(self, before: float, after: float) -> NDArray[np.float64]:
         """How far a source at infinity moves from the star between two dates (MJD), (2,), arcsec.
@@ -463,28 +414,16 @@ def hypotheses(
 ) -> Hypotheses:
     """Compare three hypotheses on the motion of a source, with its flux marginalised.
 
-    The likelihood of the data is integrated over the flux, which is the same at all epochs, over
-    the place at the reference epoch, and over the places at the others that a hypothesis allows.
-
-    Parameters
-    ----------
-    maps : sequence of SkyMap
-        Of two epochs or more.
-    flux : mapping of str to float
-        Contrast of the source by the name of the map, up to a common factor: its spectrum.
-    place : (2,)
-        East and north of the star at the reference epoch, arcsec.
-    reference : float
-        That epoch, MJD.
-    motion : Motion
-    seed : int
-        Of the places at which the integrals are evaluated.
-
-    Returns
-    -------
-    Hypotheses
+    `maps` are of two epochs or more; `flux` has the contrast of the source by the name of the map,
+    up to a common factor, and `place` (2,) east and north of the star at the epoch `reference`,
+    MJD, arcsec.
     """
     place = np.asarray(place, dtype=float)
+    # The likelihood of the data is integrated over the flux F, which is the same at all epochs,
+    # over the place at the reference epoch, and over the places at the others that a hypothesis
+    # allows. At a place, with numerator a and information b of the amplitude of the spectrum, it is
+    # exp(F a - F^2 b / 2) times that without a source. A peak of S/N s in noise with the curvature
+    # L is known to 1 / (s sqrt(L)) in each direction.
     epochs = epochs_of(maps)
     nearest = min(epochs, key=lambda each: abs(date_of(each) - reference))
     own, others = nearest, [each for each in epochs if each is not nearest]
@@ -534,15 +473,11 @@ def _at_other_epoch(
     width: float,
     rng: np.random.Generator,
 ) -> Image:
-    """Logarithm of the likelihood of an epoch, averaged over the places that are allowed there.
-
-    Importance sampling: half of the samples are about the expected place, half about the highest
-    peak within its reach.
-
-    Returns
-    -------
-    ndarray, (levels, places)
-    """
+    """Logarithm of the likelihood of an epoch, averaged over places, (levels, places)."""
+    # Importance sampling: with samples from a density q, the average of the likelihood over the
+    # density p of places is the mean of likelihood p / q. Half of the samples are about the
+    # expected place, half about the highest peak within its reach, and q is the mean of both
+    # densities.
     wide = math.hypot(spread, width)
     samples = centre + wide * rng.normal(size=(_SAMPLES, 2))
     a, b = _evidence_terms(epoch, flux, samples)
@@ -601,15 +536,7 @@ def signal(epoch: Sequence[SkyMap], flux: Mapping[str, float], place: Image) -> 
 
 
 def maximum(height: Callable[[Image], float], start: Image, step: float) -> tuple[Image, float]:
-    """Place, (2,), and value of the nearest maximum of a function of the place.
-
-    Parameters
-    ----------
-    height : callable
-    start : ndarray, (2,)
-    step : float
-        First step, arcsec.
-    """
+    """Place, (2,), and value of the nearest maximum of a function; the first step is in arcsec."""
     simplex = start + step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     result = optimize.minimize(
         lambda place: -height(place),
@@ -630,16 +557,9 @@ def maximum(height: Callable[[Image], float], start: Image, step: float) -> tupl
 
 
 class Family:
-    """Spectra that are searched together: those of a list, or any without negative fluxes.
+    """Spectra (k, filters) that are searched together; None for any without negative fluxes.
 
-    Parameters
-    ----------
-    spectra : ndarray, (k, filters), or None
-        None for free fluxes.
-    stack : SkyStack
-        At the pixels of the field, (filters, n).
-    area : float
-        Of a pixel, arcsec^2.
+    The stack (filters, n) is at the pixels of the field, and `area` that of one, arcsec^2.
     """
 
     def __init__(self, spectra: Image | None, stack: SkyStack, area: float) -> None:
@@ -684,6 +604,10 @@ class Family:
                         + share * _density(d, level)
                     )
             return total
+        # The expected number is a sum over dimensions of the curvatures of the searched set times
+        # the densities of the Euler characteristic. Those of the field are its area, half its
+        # perimeter, as if it were a square, and 1; those of field times arc are their products with
+        # the angle.
         zero, one, two, three = (_density(d, level) for d in range(4))
         area = self._areas[0].sum()
         total = area * two + 2 * math.sqrt(area) * one + zero
@@ -711,11 +635,10 @@ def _density(dimension: int, level: float) -> float:
 
 
 def _orthant(count: int) -> NDArray[np.float64]:
-    """Lipschitz-Killing curvatures of the part of a sphere without negative coordinates, (count,).
-
-    The length of a vector of noise without its negative coordinates is chi of k degrees of freedom
-    with the probability C(count, k) / 2^count, and chi is the maximum over a whole sphere.
-    """
+    """Lipschitz-Killing curvatures of the sphere's part without negative coordinates, (count,)."""
+    # The length of a vector of noise without its negative coordinates is chi of k degrees of
+    # freedom with the probability C(count, k) / 2^count, and chi is the maximum over a whole
+    # sphere.
     total = np.zeros(count)
     for k in range(1, count + 1):
         for d in range(k - 1, -1, -2):

@@ -52,20 +52,9 @@ _ALIGNED = 1e-6
 class Templates:
     """Images of planets in frames that were refined together, in the data's unit.
 
-    Positions are x, y from the star in arcsec, in the first frame. The other frames may be rolled
-    and have their stars at other positions.
-
-    Parameters
-    ----------
-    fit : Refinement
-        Reference stars among its frames show no planets and are left out.
-    origin : FrameFit
-        The frame whose pixels and orientation positions refer to.
-
-    Attributes
-    ----------
-    frames : dict of int to FrameFit
-        Frames of the target, by their place in the fit.
+    Positions are x, y from the star in arcsec, in the frame `origin`. The others may be rolled and
+    have their stars at other positions. `frames` are those of the target, by their place in the
+    fit.
     """
 
     def __init__(self, fit: Refinement, origin: FrameFit) -> None:
@@ -123,13 +112,7 @@ class Templates:
         return shift.cpu() + self._star(frame)
 
     def at_pixels(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> dict[int, Tensor]:
-        """Planets at pixel centres of the first frame.
-
-        Returns
-        -------
-        dict of int to Tensor, (k, ny, nx), float32
-            By the frame's place in the linear model.
-        """
+        """Planets at pixel centres of the first frame, (k, ny, nx), float32, by frame."""
         offsets = torch.from_numpy(self.grid[rows, columns])
         images = {}
         for k, frame in self.frames.items():
@@ -160,6 +143,7 @@ class Templates:
         Those that are not on the detector have no light.
         """
         detector = self.frames[k].model.detector
+        # In thirds of a pixel, a place is 3 times the nearest pixel plus -1, 0 or 1.
         fine = (_FINE * self._pixels(k, offsets)).round().to(torch.int64)
         pixel = torch.div(fine + _FINE // 2, _FINE, rounding_mode="floor")
         part = fine - _FINE * pixel
@@ -175,18 +159,9 @@ class Templates:
         return images
 
     def at(self, offsets: Tensor, slopes: bool = False) -> dict[int, Tensor]:
-        """Planets anywhere, with the model as fine as it was fitted.
+        """Planets at x, y (k, 2) in the first frame, arcsec, with the model as it was fitted.
 
-        Parameters
-        ----------
-        offsets : Tensor, (k, 2), float64
-            x, y from the star in the first frame, arcsec.
-        slopes : bool
-            Also the derivatives with respect to x and y.
-
-        Returns
-        -------
-        dict of int to Tensor, (k, ny, nx), or (3, k, ny, nx) with slopes; float64
+        They are (k, ny, nx) by frame, or (3, k, ny, nx) with derivatives by x and y; float64.
         """
         images = {}
         for k in self.frames:
@@ -201,15 +176,13 @@ class Templates:
             return (self.frames[k].flux * self.image(k, offset)).cpu()
 
     def _with_slopes(self, k: int, offset: Tensor) -> Tensor:
-        """Light of a planet and its derivatives, (3, ny, nx).
-
-        Central differences: a fast path renders single stars, but only without forward-mode
-        derivatives, which take three times as long as four more images.
-        """
+        """Light of a planet and its derivatives by x and y, (3, ny, nx), per arcsec."""
         key = (k, *offset.tolist())
         if key not in self._rendered:
             if len(self._rendered) >= _KEPT:
                 self._rendered.clear()
+            # Central differences: a fast path renders single stars, but only without forward-mode
+            # derivatives, which take three times as long as four more images.
             parts = [self._light(k, offset)]
             for step in _DIFFERENCE * torch.eye(2, dtype=torch.float64):
                 change = self._light(k, offset + step) - self._light(k, offset - step)
@@ -224,6 +197,7 @@ class Templates:
         """
         frame = self.frames[k]
         place = self._star(frame) + _BEYOND
+        # The pixel n // 2 of an even number is half a pixel beyond the middle of the array.
         middle = torch.tensor(
             [
                 0.0 if n % 2 else scale / 2
@@ -242,15 +216,9 @@ class Templates:
         return self._star(self.frames[k]) + self._turned(k, offset)
 
     def image(self, k: int, offset: Tensor, change: Tensor | None = None) -> Tensor:
-        """One planet in frame k, as a fraction of the star's light, (ny, nx).
+        """One planet at x, y (2,) in frame k, as a fraction of the star's light, (ny, nx).
 
-        Parameters
-        ----------
-        k : int
-        offset : Tensor, (2,)
-            As for `at`.
-        change : Tensor, (npix, npix), optional
-            Of the fitted wavefront, m.
+        `change` is added to the fitted wavefront, (npix, npix), m.
         """
         frame = self.frames[k]
         values = {**frame.optical_values, "star_offset": self.place_of(k, offset)}
@@ -294,14 +262,7 @@ def groups_of(fits: Sequence[Refinement]) -> list[Group]:
 def weigh(
     groups: Sequence[Group], render: Callable[[Templates], Mapping[int, Tensor]]
 ) -> TemplateProducts:
-    """Inner products of templates with the data, summed over groups.
-
-    Parameters
-    ----------
-    groups : sequence of (LinearModel, Templates)
-    render : callable
-        Returns the templates (k, ny, nx) of a group by frame.
-    """
+    """Inner products of the data with templates, (k, ny, nx) by frame, summed over groups."""
     products = [linear.weigh(render(templates)) for linear, templates in groups]
     return TemplateProducts(
         *(torch.stack(parts).sum(dim=0) for parts in zip(*products, strict=True))
@@ -317,26 +278,15 @@ def combine_frames(
     errors: Mapping[int, Image],
     offsets: Image,
 ) -> tuple[Image, Image]:
-    """Average frames, weighted by their errors, at positions about the star.
+    """Average frames, weighted by their errors, at positions about the star, and their errors.
 
-    Parameters
-    ----------
-    templates : Templates
-        Of the fit, which knows where the star is in every frame.
-    images : mapping of int to ndarray, (ny, nx)
-        By frame. Invalid pixels get no weight, but cubic splines reach over them: they need finite
-        values.
-    errors : mapping of int to ndarray, (ny, nx)
-        Standard deviations; inf for invalid pixels.
-    offsets : ndarray, (rows, columns, 2)
-        Positions, x and y from the star in the first frame, arcsec.
-
-    Returns
-    -------
-    image, error : ndarray, (rows, columns)
-        NaN where no frame has a valid pixel.
+    Images and standard deviations (inf for invalid pixels) are (ny, nx) by frame, and `offsets`
+    (rows, columns, 2) x, y from the star in the first frame, arcsec. Results are (rows, columns),
+    NaN where no frame has a valid pixel.
     """
     shape = offsets.shape[:2]
+    # Invalid pixels get no weight, but cubic splines reach over them: their images need finite
+    # values.
     total, weights = np.zeros((2, *shape))
     for k, image in images.items():
         places = templates.pixels_of(k, torch.from_numpy(offsets.reshape(-1, 2)))

@@ -93,24 +93,13 @@ _FITTED = 9
 
 @dataclass(frozen=True, eq=False)
 class WholeFrame:
-    """A whole frame with the fitted star and the background removed.
+    """A whole frame with the fitted star and the background removed."""
 
-    Attributes
-    ----------
-    fit : FrameFit
-        Fit of the star in the pixels about it.
-    observation : Observation
-        The whole frame, of which the fit has a part.
-    roll : float
-        Rotation of the sky from the first frame to this one, degrees.
-    candidates : ndarray, (k, 3)
-        Contrast, and x, y from the star in the first frame, of the sources that were found in the
-        fitted pixels. They are removed as well.
-    """
-
-    fit: FrameFit
-    observation: Observation
-    roll: float
+    fit: FrameFit  # Of the star in the pixels about it.
+    observation: Observation  # The whole frame, of which the fit has a part.
+    roll: float  # Rotation of the sky from the first frame to this one, degrees.
+    # (k, 3), contrast, and x, y from the star in the first frame, of the sources that were found in
+    # the fitted pixels. They are removed as well.
     candidates: Image = field(default_factory=lambda: np.zeros((0, 3)))
 
     @cached_property
@@ -176,16 +165,16 @@ class WholeFrame:
 
     @cached_property
     def sigma(self) -> Image:
-        """Standard deviation of the noise, (ny, nx); inf where masked, and in outliers.
-
-        An outlier is brighter than its neighbours allow: of all positions of a source, that in the
-        middle of a pixel leaves the neighbours least of its light.
-        """
+        """Standard deviation of the noise, (ny, nx); inf where masked, and in outliers."""
         combined = self.observation.combined()
         sigma = np.where(combined.valid[0], combined.error[0], np.inf)
         middle = _KERNEL // 2
         cross = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
         window = (slice(middle - 1, middle + 2),) * 2
+        # An outlier is brighter than its neighbours allow: of all positions of a source, that in
+        # the middle of a pixel leaves the neighbours least of its light, a mean of `share` of the
+        # peak. A pixel may therefore have the mean of its neighbours over `share`, whose variance
+        # is that of a pixel over 4 share^2.
         share = (self.kernel[window] * cross).sum() / self.kernel[middle, middle]
         allowed = np.maximum(convolve(self.residual, cross), 0.0) / share
         uncertain = _OUTLIER * combined.error[0] * math.sqrt(1 + 0.25 / share**2)
@@ -247,11 +236,10 @@ class WholeFrame:
         return np.asarray(np.maximum(light, 0) / np.maximum(total, 1e-300))
 
     def products(self, image: Image) -> tuple[Image, Image]:
-        """Template times image and template times template, over the variance, at every pixel.
-
-        The template's mean is removed, so that a level that is constant over it does not matter.
-        """
+        """Template times image and template times template, over the variance, at every pixel."""
         weight = self.sigma**-2.0
+        # The template's weighted mean m is removed, so that a level that is constant over it does
+        # not matter: sum w d (t - m) and sum w (t - m)^2 with m = sum w t / sum w.
         source = self.kernel[::-1, ::-1]
         flat = np.ones_like(source)
 
@@ -286,18 +274,10 @@ class WholeFrame:
         return slice(begin[0], end[0]), slice(begin[1], end[1])
 
     def gaussian(self, window: tuple[slice, slice]) -> Callable[[Image, Image], Image]:
-        """Images of sources of contrast 1 with the shape of a Gaussian.
+        """Images of sources of contrast 1 with the shape of a Gaussian, in a window of pixels.
 
-        Parameters
-        ----------
-        window : (slice, slice)
-            Rows and columns of the images, see `window_about`.
-
-        Returns
-        -------
-        callable
-            Takes x, y from the star in the first frame, (2,), arcsec, and the covariance of the
-            Gaussian, (2, 2), arcsec^2 along the axes of the first frame; 0 for a point source.
+        The function takes x, y from the star in the first frame, (2,), arcsec, and the covariance
+        of the Gaussian, (2, 2), arcsec^2 along the axes of the first frame; 0 for a point source.
         """
         ny, nx = self.observation.shape
         rows, columns = np.arange(ny)[window[0]], np.arange(nx)[window[1]]
@@ -315,6 +295,8 @@ class WholeFrame:
 
         def image(offset: Image, covariance: Image) -> Image:
             x, y = self.pixels_of(offset)
+            # The transform of a Gaussian of covariance S is exp(-2 pi^2 k S k), and that of a shift
+            # a phase.
             (xx, xy), (_, yy) = 2 * np.pi**2 * to_pixels @ covariance @ to_pixels.T
             smoothed = np.exp(-(xx * kx**2 + yy * ky**2 + 2 * xy * kx * ky))
             along_x, along_y = (
@@ -355,15 +337,9 @@ class WholeFrame:
     ) -> tuple[Image, Image, float] | None:
         """Fit a point source to an image, starting from its position and contrast.
 
-        Returns
-        -------
-        values, errors : ndarray, (3,)
-            Contrast, and x, y from the star in the first frame, arcsec.
-        chi2 : float
-            Reduced chi-squared.
-        None
-            If the source is not where this frame is searched, before or after the fit, or if that
-            fails.
+        Values and errors (3,) are contrast, and x, y from the star in the first frame, arcsec; the
+        third result is the reduced chi-squared. None if the source is not where this frame is
+        searched, before or after the fit, or if that fails.
         """
         from photutils.psf import PSFPhotometry
 
@@ -754,17 +730,9 @@ def wide_field(
 
 
 def require_outer_pixels(observation: Observation, size: int) -> None:
-    """Refuse a frame of which a search beyond the fitted square leaves no pixel.
+    """Refuse a frame of which a search beyond the fitted square of side `size` leaves no pixel.
 
-    Parameters
-    ----------
-    observation : Observation
-    size : int
-        Side of the fitted square, pixels.
-
-    Raises
-    ------
-    IncompatibleSetupError
+    Raises `IncompatibleSetupError`.
     """
     ny, nx = observation.shape
     if max(ny, nx) <= size + 2 * EDGE or min(ny, nx) <= 2 * EDGE:
@@ -1013,16 +981,8 @@ def _shaped(
 ) -> _Source:
     """Fit the image of a point source and of a Gaussian, and choose by chi-squared and width.
 
-    Parameters
-    ----------
-    frames, images
-        Frames, and their data without other sources.
-    parts : sequence of _Measurement
-        Point sources that make up the source.
-    scale : float
-        Squared error factor.
-    resolution : float
-        lambda/D, arcsec.
+    `images` are the data of frames without other sources, and `parts` the point sources that make
+    up this one. `scale` is the squared error factor, and `resolution` lambda/D, arcsec.
     """
     places, contrasts = _light_of(parts)
     total = contrasts.sum()
@@ -1039,6 +999,7 @@ def _shaped(
     ]
 
     def residuals(values: Image) -> Image:
+        # A covariance R R^T with a lower triangle R has no negative eigenvalue.
         root = np.zeros((2, 2))
         root[[0, 1, 1], [0, 0, 1]] = [*values[3:], 0, 0, 0][:3]
         left = [

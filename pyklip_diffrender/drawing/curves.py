@@ -106,15 +106,9 @@ def completeness(
 ) -> None:
     """Draw the fraction of planets that are found against separation and contrast.
 
-    Parameters
-    ----------
-    ax : Axes
-    table : QTable
-        Columns separation, contrast and completeness, with as many contrasts at each separation.
-    curve : QTable
-        Columns separation and contrast: the limits at 5 sigma.
-    half, most : sequence of float
-        Contrasts at which 50 and 95 % are found, by separation; may be NaN.
+    `table` has columns separation, contrast and completeness, with as many contrasts at each
+    separation, and `curve` separation and contrast of the limits at 5 sigma. `half` and `most` are
+    the contrasts at which 50 and 95 % are found, by separation; may be NaN.
     """
     place, contrast = table["separation"].value, np.asarray(table["contrast"])
     fraction = np.asarray(table["completeness"])
@@ -158,11 +152,7 @@ def _edges(middles: NDArray[np.float64]) -> NDArray[np.float64]:
 def injected_planets(ax: Axes, planets: QTable) -> None:
     """Draw recovered over injected contrast against separation.
 
-    Parameters
-    ----------
-    ax : Axes
-    planets : QTable
-        Columns separation, injected, contrast, contrast_error and detected.
+    `planets` has columns separation, injected, contrast, contrast_error and detected.
     """
     ratio, error = (
         np.asarray(planets[name] / planets["injected"]) for name in ("contrast", "contrast_error")
@@ -184,18 +174,10 @@ def survey_limits(
     candidates: Sequence[tuple[float, float]],
     sigmas: float,
 ) -> None:
-    """Draw contrast limits against separation for all stars, with their candidates.
+    """Draw contrast limits at `sigmas` against separation for all stars, with their candidates.
 
-    Parameters
-    ----------
-    ax : Axes
-    curves : sequence of (str, array, array)
-        Name, separations in arcsec, and contrasts. If there are more than there are colours, the
-        curves are grey and their median is shown.
-    candidates : sequence of (float, float)
-        Separation and contrast.
-    sigmas : float
-        Significance of the limits.
+    A curve is a name, separations in arcsec and contrasts; a candidate is a separation and a
+    contrast. If there are more curves than colours, they are grey and their median is shown.
     """
     few = len(curves) <= len(_COLORS)
     for k, (name, separation, contrast) in enumerate(curves):

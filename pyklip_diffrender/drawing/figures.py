@@ -81,11 +81,7 @@ def circles(ax: Axes, places: ArrayLike, labels: Sequence[str] = ()) -> None:
 def compass(ax: Axes, position_angle: float) -> None:
     """Draw arrows to north and east in the lower left corner.
 
-    Parameters
-    ----------
-    ax : Axes
-    position_angle : float
-        Position angle of the image's +y axis, degrees east of north.
+    `position_angle` is that of the image's +y axis, degrees east of north.
     """
     angle = radians(position_angle)
     # Whichever way the arrows point, they stay inside.
@@ -124,10 +120,7 @@ _BOX = (0.17, 0.13, 0.6, 0.77)
 def axes_for(ax: Any, count: int) -> Sequence[Axes]:
     """Return the axes of the caller, or those of a new figure with one row.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For another number of axes.
+    Raises `IncompatibleSetupError` for another number of axes than `count`.
     """
     if ax is None:
         from matplotlib import pyplot

@@ -32,28 +32,15 @@ _ON_CURVE = 181
 
 @dataclass(frozen=True, eq=False)
 class Stamp:
-    """The pixels about a source in one frame; NaN where they are masked or outside of it.
+    """The pixels about a source in one frame; NaN where they are masked or outside of it."""
 
-    Attributes
-    ----------
-    x, y : ndarray, (n,)
-        Coordinates of the pixels from the star, arcsec.
-    data, subtracted, model : ndarray, (n, n)
-        The frame, the frame without the star and everything else that is not the source, and the
-        source, in the frame's unit.
-    noise : ndarray, (n, n)
-        Standard deviations of the pixels, in the same unit.
-    north : float or None
-        Position angle of +y, degrees east of north.
-    """
-
-    x: Array
+    x: Array  # (n,), x of the pixels from the star, arcsec; y likewise.
     y: Array
-    data: Array
-    subtracted: Array
-    model: Array
-    noise: Array
-    north: float | None
+    data: Array  # (n, n), the frame in its unit, as the others are.
+    subtracted: Array  # (n, n), without the star and everything else that is not the source.
+    model: Array  # (n, n), the source.
+    noise: Array  # (n, n), standard deviations of the pixels.
+    north: float | None  # Position angle of +y, degrees east of north.
 
 
 def stamp_panels(stamp: Stamp, unit: str) -> Figure:
@@ -91,19 +78,9 @@ def stamp_panels(stamp: Stamp, unit: str) -> Figure:
 def corner(names: Sequence[str], values: Array, covariance: Array, labels: Sequence[str]) -> Figure:
     """Draw the Gaussian of a few measured values: marginal distributions, and ellipses of pairs.
 
-    Parameters
-    ----------
-    names : sequence of str, (n,)
-        Of the axes, with units.
-    values : ndarray, (n,)
-    covariance : ndarray, (n, n)
-    labels : sequence of str, (n,)
-        Values with their errors, as titles.
-
-    Returns
-    -------
-    Figure
-        Ellipses have one and two standard deviations: 39 and 86 % of the probability.
+    `names` (n) are those of the axes, with units, `values` is (n,), `covariance` (n, n), and
+    `labels` (n) are values with their errors, as titles. Ellipses have one and two standard
+    deviations: 39 and 86 % of the probability.
     """
     from matplotlib.figure import Figure
 
@@ -127,6 +104,8 @@ def corner(names: Sequence[str], values: Array, covariance: Array, labels: Seque
             ax.set_ylim(0, 1.1)
         else:
             pair = [column, row]
+            # With a covariance L L^T, the ellipse of one standard deviation is L times the unit
+            # circle.
             root = np.linalg.cholesky(covariance[np.ix_(pair, pair)])
             circle = root @ np.stack([np.cos(turn), np.sin(turn)])
             for sigmas in _SIGMAS:
@@ -152,34 +131,21 @@ def corner(names: Sequence[str], values: Array, covariance: Array, labels: Seque
 
 @dataclass(frozen=True, eq=False)
 class Epoch:
-    """Sources that were measured at one date.
-
-    Attributes
-    ----------
-    label : str
-    places, errors : ndarray, (k, 2)
-        Offsets from the star to the east and north and their standard deviations, arcsec.
-    background : ndarray, (2,) or None
-        Where a source in the background would be that was at the place of the first epoch.
-    """
+    """Sources that were measured at one date."""
 
     label: str
+    # (k, 2), offsets from the star to the east and north, arcsec; errors are their deviations.
     places: Array
     errors: Array
+    # (2,), where a source in the background would be that was at the place of the first epoch.
     background: Array | None
 
 
 def sky_track(ax: Axes, epochs: Sequence[Epoch], start: Array, title: str) -> None:
     """Draw where sources were measured, and the way of one in the background; east is left.
 
-    Parameters
-    ----------
-    ax : Axes
-    epochs : sequence of Epoch
-        In order of time.
-    start : ndarray, (2,)
-        Offset of the source at the first epoch, to which the view belongs, arcsec.
-    title : str
+    Epochs are in order of time, and `start` (2,) is the offset at the first of them of the source
+    to which the view belongs, arcsec.
     """
     markers = "osD^vP*X"
     way = np.array([start, *(each.background for each in epochs if each.background is not None)])

@@ -49,20 +49,13 @@ _KERNEL_REACH = 3
 
 
 def interpolation_matrix(places: NDArray[np.float64], shape: tuple[int, int]) -> sparse.csr_matrix:
-    """Make the matrix that interpolates an image at places between its pixels (Lanczos, 3 pixels).
+    """Make the matrix (n, ny * nx) that interpolates an image at places (n, 2) between its pixels.
 
-    Parameters
-    ----------
-    places : ndarray, (n, 2)
-        x, y, 0-indexed pixels of the image.
-    shape : tuple of int
-        (ny, nx) of the image, which is zero beyond its edges.
-
-    Returns
-    -------
-    csr_matrix, (n, ny * nx)
+    The places are x, y in 0-indexed pixels of an image of `shape` (ny, nx), which is zero beyond
+    its edges.
     """
     ny, nx = shape
+    # Lanczos' kernel over 3 pixels to each side, the product of those in x and y.
     steps = np.arange(1 - _KERNEL_REACH, 1 + _KERNEL_REACH)
     first = np.floor(places).astype(np.int64)
     columns, rows = (first[:, k, None] + steps for k in (0, 1))
@@ -127,30 +120,17 @@ _BATCH = 12
 
 
 class SkyModel:
-    """The sky in the frames of fits of one target.
-
-    Parameters
-    ----------
-    fits : sequence of Refinement
-
-    Attributes
-    ----------
-    shape : tuple of int
-        (ny, nx) of the sky.
-    center : int
-        Row and column of the star in it.
-    pixelscale, resolution : float
-        Side of a pixel and lambda/D, arcsec.
-    grid : ndarray, (ny, nx, 2)
-        x, y of the sky's pixels from the star, arcsec; y to the north and x to the west if the
-        orientation of the frames is known, else along the axes of the first frame.
-    """
+    """The sky in the frames of fits of one target."""
 
     def __init__(self, fits: Sequence[Refinement]) -> None:
         self.groups = groups_of(fits)
         first = fits[0].frames[0]
         self.pixelscale = math.sqrt(math.prod(first.observation.pixelscale))
         side = int(_MARGIN * max(first.observation.shape)) | 1
+        # `shape` is (ny, nx), and `center` the row and column of the star. `grid` (ny, nx, 2) has
+        # x, y from the star in arcsec, with y to the north and x to the west if the orientation of
+        # the frames is known, else along the axes of the first frame. `pixelscale` and `resolution`
+        # (lambda/D) are in arcsec.
         self.shape, self.center = (side, side), side // 2
         y, x = np.indices(self.shape) - self.center
         self.grid = self.pixelscale * np.stack([x, y], axis=-1)
@@ -166,6 +146,8 @@ class SkyModel:
         self.resolution = float(model.bandpass.mean_wavelength) / model.diameter / ARCSEC
         reach = math.ceil(_REACH * self.resolution / self.pixelscale)
         self._point_sources = [self._point_source(templates, reach) for _, templates in self.groups]
+        # In white noise n, a source of peak T has a S/N of T |P| / n, so that T = `_STRENGTH` n /
+        # |P|.
         self._prior = _STRENGTH * self._noise() / np.linalg.norm(self._point_sources[0])
         self._beam, self._response = self._beam_and_response()
 
@@ -179,27 +161,24 @@ class SkyModel:
         return np.asarray(cut / cut.max())
 
     def _beam_and_response(self) -> tuple[Image, Image]:
-        """Transforms of the beam, and of a point source in white noise as it shows it.
-
-        The beam is such that the peak of the source stays 1.
-        """
+        """Transforms of the beam, and of a point source in white noise as it shows it."""
         width = _BEAM * self.resolution / self.pixelscale / math.sqrt(8 * math.log(2))
         frequency = np.fft.fftfreq(self.shape[0])
         beam = np.exp(-2 * (math.pi * width) ** 2 * (frequency[:, None] ** 2 + frequency**2))
         source = self._point_sources[0]
+        # In white noise B^T Sigma^-1 B is a convolution with the transform s^2 p, where s is the
+        # strength of the prior and p the power of P / |P|. The estimate is therefore a filter that
+        # keeps s^2 p / (1 + s^2 p) of each frequency. Its value in the middle is the mean over
+        # frequencies, by which the beam is divided so that a peak stays 1.
         power = np.abs(np.fft.fft2(source / np.linalg.norm(source), s=self.shape)) ** 2
         kept = _STRENGTH**2 * power / (1 + _STRENGTH**2 * power)
         peak = (beam * kept).mean()
         return np.asarray(beam / peak), np.asarray(beam * kept / peak)
 
     def places(self, offsets: Image, angle: float) -> Image:
-        """Place in the sky, (n, 2), of x, y in arcsec from the star in a frame.
+        """Place in the sky, (n, 2), of x, y in arcsec from the star in a frame, (..., 2).
 
-        Parameters
-        ----------
-        offsets : ndarray, (..., 2)
-        angle : float
-            Position angle of the frame's +y axis, degrees.
+        `angle` is the position angle of the frame's +y axis, degrees.
         """
         x, y = np.moveaxis(offsets, -1, 0).reshape(2, -1)
         sine, cosine = math.sin(math.radians(angle)), math.cos(math.radians(angle))
@@ -264,6 +243,7 @@ class SkyModel:
         def norm(images: Image) -> Image:
             return np.asarray((images**2).sum(axis=(1, 2)))
 
+        # All systems have the same matrix, and each its own lengths along its directions.
         solution, residual = np.zeros_like(right), right.copy()
         direction, size = right.copy(), norm(right)
         enough = _TOLERANCE**2 * size
@@ -280,16 +260,9 @@ class SkyModel:
         return solution
 
     def estimate(self, light: Light | None = None) -> Image:
-        """Posterior mean of the sky, seen with the beam.
+        """Posterior mean of the sky, (k, ny, nx), seen with the beam.
 
-        Parameters
-        ----------
-        light : sequence of dict of int to Tensor, (k, ny, nx), optional
-            Data minus star by frame for every fit; those of the fits by default.
-
-        Returns
-        -------
-        ndarray, (k, ny, nx)
+        `light` is data minus star, (k, ny, nx) by frame for every fit; that of the fits by default.
         """
         images = self.light() if light is None else light
         return self._seen(self._prior * self._solved(self._prior * self._collected(images)))
@@ -303,39 +276,19 @@ class SkyModel:
         return np.asarray(np.fft.irfft2(product, s=self.shape))
 
     def of_sources(self, offsets: Image, peaks: Image, angle: float) -> Image:
-        """Known point sources as the estimate would show them in white noise.
+        """Known point sources as the estimate would show them in white noise, (ny, nx).
 
-        Parameters
-        ----------
-        offsets : ndarray, (k, 2)
-            x, y from the star in a frame, arcsec.
-        peaks : ndarray, (k,)
-        angle : float
-            Position angle of the frame's +y axis, degrees.
-
-        Returns
-        -------
-        ndarray, (ny, nx)
+        `offsets` (k, 2) are x, y from the star in a frame, arcsec, with the peaks (k,); `angle` is
+        the position angle of the frame's +y axis, degrees.
         """
         sources = interpolation_matrix(self.places(offsets, angle), self.shape).T @ peaks
         return self._filtered(sources.reshape(self.shape), self._response)
 
     def error(self, seed: int = 0) -> Image:
-        """Standard deviation that the noise of the frames has in the estimate, by separation.
-
-        With A = (1 + B^T Sigma^-1 B)^-1, the covariance of u is A - A^2. The diagonal of that of
-        the image, Q, is the expectation of z * (Q z) for random signs z (C. Bekas, E. Kokiopoulou
-        and Y. Saad 2007, Applied Numerical Mathematics 57, 1214).
-
-        Parameters
-        ----------
-        seed : int
-            Of the signs.
-
-        Returns
-        -------
-        ndarray, (ny, nx)
-        """
+        """Standard deviation of the estimate by the frames' noise, by separation, (ny, nx)."""
+        # With A = (1 + B^T Sigma^-1 B)^-1, the covariance of u is A - A^2. The diagonal of that of
+        # the image, Q, is the expectation of z * (Q z) for random signs z (C. Bekas, E. Kokiopoulou
+        # and Y. Saad 2007, Applied Numerical Mathematics 57, 1214).
         covered = sum(m.sum(axis=0) for part in self._onto_frames for m in part.values())
         # The prior is wide where no frame is, so that those places would hide all others.
         inside = np.asarray(covered).reshape(self.shape) > 0.5
@@ -350,19 +303,10 @@ class SkyModel:
     def throughput(self, seed: int = 0) -> Image:
         """Fraction of the peak of a faint point source that the estimate keeps, by separation.
 
-        Sources in combs, with random signs, are measured together. What they change in the star
-        at each other's places averages out over the median of a ring of lambda/D.
-
-        Parameters
-        ----------
-        seed : int
-            Of the signs.
-
-        Returns
-        -------
-        ndarray, (ny, nx)
-            For sources at the pixels of the first frame.
+        It is (ny, nx), for sources at the pixels of the first frame.
         """
+        # Sources in combs, with random signs, are measured together. What they change in the star
+        # at each other's places averages out over the median of a ring of lambda/D.
         first = self.groups[0][1].origin
         ny, nx = first.observation.shape
         rows, columns = (np.arange(0, n, _STEP) for n in (ny, nx))

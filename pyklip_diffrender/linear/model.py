@@ -47,20 +47,12 @@ _PIXELS = 1024
 
 
 class Unknown(NamedTuple):
-    """One unknown of a fit.
+    """One unknown of a fit."""
 
-    Attributes
-    ----------
-    name : str
-        A parameter of the parameter table, or "companions", "amplitude", "modes" or "drift".
-    component : int
-        Index within that parameter.
-    frame : int
-        The frame whose own value it is, or the block of drift; -1 if all frames share it.
-    """
-
+    # A parameter of the parameter table, or "companions", "amplitude", "modes" or "drift".
     name: str
-    component: int
+    component: int  # Index within that parameter.
+    # The frame whose own value it is, or the block of drift; -1 if all frames share it.
     frame: int = -1
 
     def __str__(self) -> str:
@@ -70,23 +62,14 @@ class Unknown(NamedTuple):
 
 @dataclass(frozen=True)
 class FrameRows:
-    """The unknowns of a fit that the rows of one of its frames belong to.
+    """The unknowns of a fit that the rows of one of its frames belong to."""
 
-    Attributes
-    ----------
-    rows : Tensor, (rows,), int64
-        Index of the unknown that each row belongs to.
-    drift : Tensor, (blocks, some), int64
-        Indices of the unknowns by which the leading wavefront modes of this frame differ from
-        those that all frames share. One block may be the frame's own, and another one that of its
-        exposure sequence.
-    first_mode : int
-        Index of the first wavefront mode among the rows.
-    """
-
-    rows: Tensor
+    rows: Tensor  # (rows,), int64, index of the unknown that each row belongs to.
+    # (blocks, some), int64, indices of the unknowns by which the leading wavefront modes of this
+    # frame differ from those that all frames share. One block may be the frame's own, and another
+    # one that of its exposure sequence.
     drift: Tensor
-    first_mode: int
+    first_mode: int  # Index of the first wavefront mode among the rows.
 
     def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
         """Sum values by row, (rows, k), to values by unknown, (size, k)."""
@@ -107,24 +90,14 @@ class FrameRows:
 
 @dataclass(frozen=True)
 class LinearFrame(FrameRows):
-    """One frame's part of a linear model.
+    """One frame's part of a linear model."""
 
-    Attributes
-    ----------
-    residual : Tensor, (ny, nx), float64
-        Data minus prediction where the model is linearised.
-    weight : Tensor, (ny, nx), float64
-        1 / standard deviation; 0 for masked pixels.
-    jacobian : Tensor, (rows, ny, nx), float32
-        Derivatives of the pixels with respect to the unknowns, in the data's unit.
-    common : Tensor, (ny, nx), float64
-        c of the pattern that the frames share, see `Noise`, in the data's unit; 0 without
-        one.
-    """
-
-    residual: Tensor
-    weight: Tensor
+    residual: Tensor  # (ny, nx), float64, data minus prediction where the model is linearised.
+    weight: Tensor  # (ny, nx), float64, 1 / standard deviation; 0 for masked pixels.
+    # (rows, ny, nx), float32, derivatives of the pixels by the unknowns, in the data's unit.
     jacobian: Tensor
+    # (ny, nx), float64, c of the pattern that the frames share, see `Noise`, in the data's unit; 0
+    # without one.
     common: Tensor
 
     def image(self, values: Tensor) -> Tensor:
@@ -135,11 +108,9 @@ class LinearFrame(FrameRows):
         return torch.cat(parts, dim=-1).unflatten(-1, self.jacobian.shape[1:])
 
     def pulled(self, images: Tensor) -> Tensor:
-        """Products of the derivatives with images, (k, ny, nx), by row: (rows, k).
-
-        They are computed in the precision of the images. The rounding errors of single precision
-        exceed the noise where a companion's light is 1e5 standard deviations.
-        """
+        """Products of the derivatives with images, (k, ny, nx), in their precision: (rows, k)."""
+        # The rounding errors of single precision exceed the noise where a companion's light is 1e5
+        # standard deviations.
         flat, columns = self.jacobian.flatten(1), images.flatten(1).T
         if images.dtype == flat.dtype:
             return flat @ columns
@@ -176,30 +147,12 @@ def pixel_pieces(pixels: int) -> list[slice]:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise of the pixels of frames that are fitted together, with covariance C.
+    """Noise of the pixels of frames that are fitted together, with covariance C."""
 
-    Attributes
-    ----------
-    weight : tuple of Tensor, (ny, nx)
-        By frame, w: 1 / standard deviation of the independent noise; 0 for masked pixels.
-    common : tuple of Tensor, (ny, nx)
-        c of the pattern that the frames share, in the data's unit; 0 if they share none.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from pyklip_diffrender.linear.model import Noise
-    >>> ones = torch.ones(8, 8, dtype=torch.float64)
-    >>> Noise((ones, ones), (0 * ones, 0 * ones)).chi2([ones, ones])
-    128.0
-
-    A pattern may explain what the frames have in common:
-
-    >>> Noise((ones, ones), (0.7 * ones, 0.7 * ones)).chi2([ones, ones]) < 10
-    True
-    """
-
+    # By frame, w: (ny, nx), 1 / standard deviation of the independent noise; 0 for masked pixels.
     weight: tuple[Tensor, ...]
+    # By frame, c of the pattern that the frames share: (ny, nx), in the data's unit; 0 if they
+    # share none.
     common: tuple[Tensor, ...]
 
     @cached_property
@@ -285,23 +238,15 @@ _BATCH = 512
 
 
 class TemplateProducts(NamedTuple):
-    """Inner products of templates p with the data r, (k,) each.
+    """Inner products of templates p with the data r, (k,) each, marginalised over all unknowns.
 
-    Sigma is the covariance of the data, marginalised over all unknowns.
-
-    Attributes
-    ----------
-    numerator : Tensor
-        p . Sigma^-1 r.
-    information : Tensor
-        p . Sigma^-1 p.
-    photon : Tensor
-        p . C^-1 p, the information if all parameters of the star were known.
+    The amplitude is numerator / information, its standard deviation 1 / sqrt(information), or 1 /
+    sqrt(photon) if all unknowns were known.
     """
 
-    numerator: Tensor
-    information: Tensor
-    photon: Tensor
+    numerator: Tensor  # p . Sigma^-1 r, with the marginalised covariance Sigma of the data.
+    information: Tensor  # p . Sigma^-1 p.
+    photon: Tensor  # p . C^-1 p, the information if all parameters of the star were known.
 
 
 @dataclass(frozen=True)
@@ -366,6 +311,8 @@ class LinearModel:
     @cached_property
     def _factor(self) -> Tensor:
         """Lower Cholesky factor of P + G G^T, in scaled units."""
+        # Unknowns differ by many powers of ten. In the units U, the factor is that of U (P + G G^T)
+        # U, whose diagonal is 1.
         system = self.curvature * self._scale[:, None] * self._scale
         system.diagonal().add_((self._scale / self.deviation) ** 2)
         return torch.linalg.cholesky(system)
@@ -396,6 +343,9 @@ class LinearModel:
         It is small after a fit that has converged. The unknowns themselves may be far from the
         means of the priors, so that single precision would not do for them.
         """
+        # The minimum of (r - J^T s) C^-1 (r - J^T s) + sum P (x0 + s - mean)^2 is where
+        #
+        #     (P + J C^-1 J^T) s = J C^-1 r - P (x0 - mean).
         residuals = {k: frame.residual[None] for k, frame in enumerate(self.frames)}
         gradient = self._pulled(residuals)[:, 0] - (self.vector - self.mean) / self.deviation**2
         scaled = torch.cholesky_solve((gradient * self._scale)[:, None], self._factor)[:, 0]
@@ -455,6 +405,8 @@ class LinearModel:
         total = len(next(iter(templates.values())))
         for start in range(0, total, _BATCH):
             part = {k: images[start : start + _BATCH] for k, images in templates.items()}
+            # By the Woodbury identity p . Sigma^-1 p = p . C^-1 p - |L^-1 G p|^2. The last term is
+            # what the unknowns of the star absorb of the template.
             absorbed = (self.projected(part) ** 2).sum(dim=0)
             numerator = torch.zeros_like(absorbed)
             for k, images in part.items():
@@ -481,6 +433,7 @@ class LinearModel:
 
         This is the part of the templates that the unknowns cannot reproduce.
         """
+        # Sigma^-1 p = C^-1 (p - J^T s), with the change s of the most probable unknowns by p.
         change = self.response(templates)
         images = {}
         for k, frame in enumerate(self.frames):
@@ -492,6 +445,7 @@ class LinearModel:
     def normal_equations(self, templates: Mapping[int, Tensor]) -> tuple[Tensor, Tensor]:
         """Return p_i . Sigma^-1 p_j and p_i . Sigma^-1 r of templates that are fitted together."""
         projected = self.projected(templates)
+        # As in `weigh`, with all products of two templates.
         white = self.noise.whitened(templates).double()
         matrix = white @ white.T - projected.T @ projected
         vector = torch.zeros(len(matrix), dtype=torch.float64)
@@ -513,6 +467,7 @@ class LinearModel:
             Image of those unknowns by frame, in the data's unit.
         """
         keeps = torch.tensor([unknown.name != name for unknown in self.unknowns])
+        # `place` is the new index of every unknown that stays.
         place = torch.cumsum(keeps, 0) - 1
         frames = []
         for k, frame in enumerate(self.frames):

@@ -43,20 +43,7 @@ NANOMETRE = 1e-9
 
 
 class ModeFields:
-    """Derivatives of the field with respect to modes, about a wavefront.
-
-    d(exp(i k OPD)) = i k exp(i k OPD) d(OPD): the field in the pupil times the mode is propagated.
-    Cosines and sines are pairs of plane waves, whose propagation is faster, see `PlaneWaves`.
-
-    Parameters
-    ----------
-    model : OpticalSystem
-    basis : Basis
-    opd : Tensor, (npix, npix)
-        m, on the model's grid.
-    values : dict of Tensor
-        Values of the model's other parameters.
-    """
+    """Derivatives of the field with respect to modes, about a wavefront (npix, npix), m."""
 
     def __init__(
         self, model: OpticalSystem, basis: Basis, opd: Tensor, values: dict[str, Tensor]
@@ -64,23 +51,17 @@ class ModeFields:
         self._model, self._basis, self._values = model, basis, model.values(values)
         wavelengths = model.bandpass.wavelengths
         with torch.no_grad():
+            # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD): the field in the pupil times the mode is
+            # propagated. Cosines and sines are pairs of plane waves, whose propagation is faster,
+            # see `PlaneWaves`.
             self._pupils = [model.pupil_field(opd, each, self._values) for each in wavelengths]
 
     @torch.no_grad()
     def batches(self, size: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
-        """Compute the derivatives with respect to all modes, up to `size` of them at a time.
+        """Compute the derivatives with respect to all modes, `size` (at least 4) of them at a time.
 
-        Parameters
-        ----------
-        size : int
-            At least 4.
-
-        Yields
-        ------
-        modes : Tensor, (modes,), int64
-            Their places in the basis.
-        changes : list of Tensor, (modes, ny, nx), complex64
-            For each wavelength, per nm.
+        Yields the places of modes in the basis, (modes,), int64, and for each wavelength their
+        derivatives, (modes, ny, nx), complex64, per nm.
         """
         first, fourier = fourier_part(self._basis) or (len(self._basis), None)
         waves = [] if fourier is None else self._plane_waves(fourier.reach)
@@ -112,10 +93,7 @@ class ModeFields:
     def _from_waves(
         self, waves: list[PlaneWaves], fourier: FourierModes, size: int
     ) -> Iterator[tuple[Tensor, list[Tensor]]]:
-        """For the Fourier part, with places counted from its first mode.
-
-        A cosine and a sine are the sum and the difference of two opposite waves.
-        """
+        """For the Fourier part, with places counted from its first mode."""
         places = {(fx, fy): 2 * k for k, (fx, fy) in enumerate(fourier.cycles.tolist())}
         scales = [fourier.amplitude / 2 * _factor(each) for each in self._pupils]
         for fx in range(fourier.reach + 1):
@@ -127,6 +105,8 @@ class ModeFields:
                 known = [k for k, pair in enumerate(pairs) if pair in places]
                 cosines = torch.tensor([places[pairs[k]] for k in known])
                 changes = []
+                # With opposite waves e and e*, cos = (e + e*) / 2 and sin = i (e* - e) / 2. `plus`
+                # has +-fx with +fy, and `minus` the opposite of each: -+fx with -fy.
                 for each, scale in zip(waves, scales, strict=True):
                     fields = each.fields(fx, slice(fy[0], fy[-1] + 1))
                     plus = fields[:, 0].flatten(0, 1)[known]
@@ -154,12 +134,7 @@ _PIECE = 16
 
 
 class LastPupil:
-    """The pupil behind all occulters of a model, seen from the detector's samples.
-
-    Parameters
-    ----------
-    model : Propagation
-    """
+    """The pupil behind all occulters of a model, seen from the detector's samples."""
 
     def __init__(self, model: Propagation) -> None:
         self._model = model
@@ -182,14 +157,8 @@ class LastPupil:
     ) -> None:
         """Convolve fields on the detector, in place, as a change of parameters does.
 
-        The field outside the detector is taken for the field of its opposite edge.
-
-        Parameters
-        ----------
-        fields : sequence of Tensor
-            For every wavelength (count, oversample ny, oversample nx), complex64.
-        before, after : dict of Tensor
-            Values of the model's parameters.
+        There is one for every wavelength, (count, oversample ny, oversample nx), complex64. The
+        field outside the detector is taken for the field of its opposite edge.
         """
         for wavelength, field in zip(self._model.bandpass.wavelengths, fields, strict=True):
             factor = self._factor(wavelength, field, before, after)
@@ -205,7 +174,9 @@ class LastPupil:
     ) -> Tensor:
         """Factor of the spectrum of the samples, (ny, nx)."""
         detector = self._model.detector
-        # The sign of y is that of `optics.planes`. The shear of the axes is negligible here.
+        # The frequency f of samples that are t apart on the sky stands for the place lambda f / t
+        # in the pupil, where a shift of the image is a tilt of the OPD. The sign of y is that of
+        # `optics.planes`. The shear of the axes is negligible here.
         x, y = (
             torch.fft.fftfreq(count, dtype=torch.float64, device=field.device)
             * (sign * wavelength * detector.oversample / (scale * ARCSEC))
@@ -240,7 +211,7 @@ class LastPupil:
 
 # Derivatives of the image with respect to named parameters, such as a shift of the Lyot stop.
 #
-# As in `response`, the derivative of the complex field may come from a coarser model than the
+# As by the wavefront, the derivative of the complex field may come from a coarser model than the
 # field.
 
 _IMAGE_PARAMETERS = ("blur",)
@@ -252,27 +223,14 @@ def field_derivatives(
 ) -> dict[str, list[Tensor]]:
     """Derivatives of the complex field on the detector with respect to named parameters.
 
-    They are derivatives of the model itself.
-
-    Parameters
-    ----------
-    model : OpticalSystem
-        May be a coarse copy.
-    opd : Tensor, (npix, npix)
-        m.
-    values : dict of Tensor
-        Where to differentiate; must hold every name.
-    names : tuple of str
-        Names that act on the image only, such as "blur", are ignored.
-
-    Returns
-    -------
-    dict of str to list of Tensor
-        For every wavelength (components, ny, nx), per unit of the parameter table.
+    `opd` is (npix, npix), m, and `values` must hold every name. By name, for every wavelength, they
+    are (components, ny, nx), per unit of the parameter table. Names that act on the image only,
+    such as "blur", have none.
     """
     moved = {name: values[name] for name in names if name not in _IMAGE_PARAMETERS}
     if not moved:
         return {}
+    # What acts behind the occulter needs no new propagation to it.
     behind = model.parameters_behind.intersection(moved)
     wavelengths = model.bandpass.wavelengths
     with torch.no_grad():
@@ -302,20 +260,9 @@ def image_derivatives(
 ) -> Tensor:
     """Derivatives of the image from those of the field, for a star whose fields are known.
 
-    Parameters
-    ----------
-    model : OpticalSystem
-    fields : sequence of Tensor
-        The star's field at each wavelength; of a finer model, if there is one.
-    values : dict of Tensor
-    names : tuple of str
-    slopes : dict of str to list of Tensor
-        Derivatives from `field_derivatives`.
-
-    Returns
-    -------
-    Tensor, (components of all names in order, ny, nx)
-        Light per pixel per unit of the parameter table.
+    `fields` are the star's at each wavelength, of a finer model if there is one, and `slopes` are
+    from `field_derivatives`. The result is (components of all names in order, ny, nx), light per
+    pixel per unit of the parameter table.
     """
     rows = []
     for name in names:
@@ -326,6 +273,7 @@ def image_derivatives(
 
             rows += jacobian(image, values[name])
             continue
+        # d|E|^2 = 2 Re(conj(E) dE), and the detector's part is linear in the light.
         total = torch.zeros((), dtype=fields[0].real.dtype, device=model.device)
         for field, slope, weight in zip(fields, slopes[name], model.bandpass.weights, strict=True):
             total = total + 2 * weight * (field.conj() * slope).real
@@ -334,35 +282,15 @@ def image_derivatives(
 
 
 def jacobian(function: Callable[[Tensor], Sequence[Tensor]], value: Tensor) -> list[Tensor]:
-    """Differentiate tensors with respect to a few numbers, by two passes in reverse mode.
+    """Differentiate tensors with respect to a few real numbers, (components,), in reverse mode.
 
-    With weights v, the gradient of the outputs is J^T v. It is linear in v, and its derivative by v
-    is J (J. Townsend, "A new trick for calculating Jacobian vector products", 2017). As in forward
-    mode, the cost grows with the number of inputs. Forward mode takes twice as long, because torch
-    differentiates products with constants in Python.
-
-    Parameters
-    ----------
-    function : callable
-        Maps a tensor to tensors, real or complex.
-    value : Tensor, (components,)
-        Where to differentiate; real.
-
-    Returns
-    -------
-    list of Tensor
-        For every output its derivatives, (components, *shape of the output).
-
-    Examples
-    --------
-    >>> import torch
-    >>> from pyklip_diffrender.linear import jacobian
-    >>> (slopes,) = jacobian(lambda x: [x**2], torch.tensor([1.0, 3.0]))
-    >>> slopes
-    tensor([[2., 0.],
-            [0., 6.]])
+    For every output of the function, real or complex, the derivatives are (components, *its shape).
     """
     with torch.enable_grad():
+        # With weights v, the gradient of the outputs is J^T v. It is linear in v, and its
+        # derivative by v is J (J. Townsend, "A new trick for calculating Jacobian vector products",
+        # 2017). As in forward mode, the cost grows with the number of inputs. Forward mode takes
+        # twice as long, because torch differentiates products with constants in Python.
         varied = value.detach().requires_grad_()
         outputs = function(varied)
         real = [torch.view_as_real(each) if each.is_complex() else each for each in outputs]
@@ -406,12 +334,11 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
 
 
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
-    """Return a cheaper copy of a model for derivatives.
+    """Return a cheaper copy of a model for derivatives, or the model if its pupil is as coarse.
 
     It has fewer pupil samples, coarse cells, single precision, and of a bar only the part within
-    `STAR_RADIUS` of the field. If the pupil grid of the model is fixed, or is already as coarse,
-    the model itself is returned. For a wide field or mask the number of samples is doubled until
-    the image does not repeat inside it.
+    `STAR_RADIUS` of the field. For a wide field or mask the number of samples is doubled until the
+    image does not repeat inside it.
     """
     if "npix" not in model.adjustable or model.npix <= npix:
         return model
@@ -439,10 +366,7 @@ def _bar_reach(model: OpticalSystem) -> float | None:
 
 
 def downsample(opd: Tensor, npix: int) -> Tensor:
-    """Mean of the OPD over the pixels of a coarser grid, (..., npix, npix).
-
-    `npix` must divide the grid of the OPD.
-    """
+    """Mean of the OPD over the pixels of a coarser grid, (..., npix, npix) with npix a divisor."""
     factor = opd.shape[-1] // npix
     if factor == 1:
         return opd
@@ -456,28 +380,9 @@ def downsample(opd: Tensor, npix: int) -> Tensor:
 class WavefrontResponse:
     """Derivative of the complex field on the detector with respect to wavefront modes.
 
-    The field behind a coronagraph is a small difference of large fields. A small change of the
-    wavefront changes the field by a large factor, but hardly changes its derivative. Therefore
-    the derivative of the field is stored, and that of the image is computed from it and from the
-    current field of the star.
-
-    Parameters
-    ----------
-    model : OpticalSystem
-    basis : Basis
-    opd : Tensor, (n, n)
-        Wavefront about which to linearise, m.
-    values : dict of Tensor
-        Values of the model's other parameters.
-    npix : int
-        Pupil samples of the coarse copy that does the propagations.
-    wavelengths : int
-        Largest number of wavelengths at which derivatives are computed.
-    stored : bool
-        Compute and store the derivatives now; otherwise they are computed in every call of `image`
-        until `store` is called.
-    progress : bool
-        Show a progress bar.
+    It is about `opd` (n, n), m, of a coarse copy of `npix` pupil samples with at most so many
+    `wavelengths`. With `stored` the derivatives are computed now; otherwise in every call of
+    `image` until `store` is called.
     """
 
     def __init__(
@@ -493,6 +398,10 @@ class WavefrontResponse:
         progress: bool = False,
     ) -> None:
         self.model, self.basis = model, basis
+        # The field behind a coronagraph is a small difference of large fields. A small change of
+        # the wavefront changes the field by a large factor, but hardly changes its derivative.
+        # Therefore the derivative of the field is stored, and that of the image is computed from it
+        # and from the current field of the star.
         self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
         self.coarse = coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
         self._progress = progress
@@ -561,27 +470,15 @@ class WavefrontResponse:
         amplitude_modes: int = 0,
         modes: int | None = None,
     ) -> Tensor:
-        """Derivative of the image for given fields of the star.
+        """Derivative of the image for given fields of the star, as `OpticalSystem.fields` has them.
 
-        An amplitude mode is an OPD of -1j nm. It changes the field by -1j times the change that
-        the same OPD mode causes, so its derivative follows from the same response.
-
-        Parameters
-        ----------
-        fields : sequence of Tensor
-            The star's field at each wavelength, as `OpticalSystem.fields` returns it.
-        values : dict of Tensor
-            Values of the model's other parameters (the blur matters here).
-        amplitude_modes : int
-            Number of leading modes that are amplitude modes as well.
-        modes : int, optional
-            Number of leading modes; default all.
-
-        Returns
-        -------
-        Tensor, (modes + amplitude_modes, ny, nx), float32
-            Light per pixel (fraction of what the pupil collects) per nm.
+        It is (modes + amplitude_modes, ny, nx), float32, light per pixel (fraction of what the
+        pupil collects) per nm, by the leading `modes` (default all), of which `amplitude_modes` are
+        amplitude modes as well.
         """
+        # dI = sum_l 2 w_l Re(conj(E_l) J_l dx). An amplitude mode is an OPD of -i nm. It changes
+        # the field by -i times the change that the same OPD mode causes, so that its derivative is
+        # the imaginary part where the other has the real one.
         modes = len(self.basis) if modes is None else modes
         detector, count = self.coarse.detector, max(modes, amplitude_modes)
         images = torch.empty(modes + amplitude_modes, *detector.shape, device=self.model.device)
@@ -641,36 +538,19 @@ _UNSEEN = 0.01
 
 @dataclass
 class _About:
-    """Where derivatives were computed, and where they have been taken since.
+    """Where derivatives were computed, and where they have been taken since."""
 
-    Attributes
-    ----------
-    opd : Tensor
-        Inside the pupil.
-    values, now : dict of Tensor
-        Values of the parameters then, and those to which the derivatives followed.
-    """
-
-    opd: Tensor
-    values: dict[str, Tensor]
-    now: dict[str, Tensor]
+    opd: Tensor  # Inside the pupil, m.
+    values: dict[str, Tensor]  # Of the parameters where the derivatives were computed.
+    now: dict[str, Tensor]  # Of the parameters to which the derivatives followed.
 
 
 class Reading:
     """Takes derivatives from a cache, and knows the largest error of those that it has taken.
 
-    Parameters
-    ----------
-    cache : ResponseCache
-    allowed : float
-        Relative change of the field above which derivatives are computed again.
-    keep : int
-        Number of responses that the cache stores.
-
-    Attributes
-    ----------
-    farthest : float
-        Largest change of the field since the derivatives that were taken were computed.
+    The cache computes derivatives again where the field has changed by more than `allowed`, and
+    stores `keep` responses; `farthest` is the largest change since those that were taken were
+    computed.
     """
 
     def __init__(self, cache: ResponseCache, allowed: float, keep: int) -> None:
@@ -700,28 +580,8 @@ class ResponseCache:
     """Cache of wavefront responses, and of derivatives with respect to other parameters.
 
     Whoever needs to know how far its derivatives are from exact ones takes them by a `Reading`.
-
-    Parameters
-    ----------
-    model : OpticalSystem
-    basis : Basis
-    npix : int
-        Pupil samples of the coarse copy that does the propagations.
-    wavelengths : int
-        Largest number of wavelengths at which derivatives are computed.
-    relinearise : float
-        Relative change of the field (radians for a phase), rms over the pupil, above which
-        derivatives are computed again, unless a `Reading` allows another one. With parameter
-        derivatives computed at a distance of 0.2 (15 mas in the star's position), the stated error
-        of the star's position is half the correct one, and the position is off by four times that
-        error.
-    keep : int
-        Number of responses to store: one for each frame, because star positions differ.
-    memory : float
-        Number of bytes of responses to store. Those that do not fit are computed again whenever
-        they are needed, the oldest first, about the same wavefront.
-    progress : bool
-        Show progress bars.
+    Responses take at most `memory` bytes. Those that do not fit are computed again whenever they
+    are needed, about the same wavefront.
     """
 
     def __init__(
@@ -737,6 +597,11 @@ class ResponseCache:
         progress: bool = False,
     ) -> None:
         self.model, self.basis, self.npix, self.wavelengths = model, basis, npix, wavelengths
+        # The relative change of the field (radians for a phase), rms over the pupil, above which
+        # derivatives are computed again, unless a `Reading` allows another one. With parameter
+        # derivatives computed at a distance of 0.2 (15 mas in the star's position), the stated
+        # error of the star's position is half the correct one, and the position is off by four
+        # times that error. Frames differ in the star's position, so that each keeps a response.
         self._relinearise, self._keep = relinearise, keep
         self.memory, self.progress = memory, progress
         self._kept: list[tuple[_About, WavefrontResponse]] = []
@@ -762,15 +627,8 @@ class ResponseCache:
     ) -> Tensor:
         """Derivative of the image with respect to named parameters, (components, ny, nx).
 
-        Parameters
-        ----------
-        opd : Tensor, (npix, npix)
-            On the model's grid, m.
-        values : dict of Tensor
-        names : tuple of str
-            Free parameters; they must not change between calls.
-        fields : sequence of Tensor
-            The star's field at each wavelength.
+        `opd` is (npix, npix) on the model's grid, m, and `fields` are the star's at each
+        wavelength. The names must not change between calls.
         """
         return self.reading().parameters(opd, values, names, fields)
 
@@ -870,14 +728,8 @@ class ResponseCache:
     def _error(self, about: _About, opd: Tensor, values: dict[str, Tensor], tilt: float) -> float:
         """Relative error of derivatives that have followed changes in the last pupil.
 
-        Parameters
-        ----------
-        about : _About
-        opd : Tensor
-            Inside the pupil, m.
-        values : dict of Tensor
-        tilt : float
-            Error per radian of tilt, rms over the pupil.
+        `opd` is that inside the pupil, m, and `tilt` the error per radian of tilt, rms over the
+        pupil.
         """
 
         def difference(name: str) -> Tensor:

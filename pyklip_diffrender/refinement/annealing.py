@@ -58,42 +58,22 @@ NOTHING = (math.inf, math.inf)
 
 @dataclass
 class Course:
-    """Where a fit is in its schedule.
-
-    Attributes
-    ----------
-    state, best, aligned : State
-        The present one, the one of the least model error, and the one that ended the alignment.
-    carried : StepState
-        What the last step hands on to the next one.
-    settings : GaussNewton
-        Those of the fit, with the size of the drift between frames once it is measured.
-    kappa : float
-        Assumed error of the star model, as a fraction of the star.
-    modes : int
-        Number of leading wavefront modes that are free; 0 for the alignment.
-    remaining : int
-        Number of steps that may follow.
-    error, chi2 : float
-        Model error and chi-squared per pixel of `state`.
-    least : (float, float)
-        Model error and chi-squared per pixel of `best`.
-    may_drop : bool
-        Whether companions may be dropped. They may not after some were added to a fit that had
-        stalled, or it might add and drop them for ever.
-    """
+    """Where a fit is in its schedule."""
 
     state: State
-    best: State
-    aligned: State
-    carried: StepState
+    best: State  # Of the least model error.
+    aligned: State  # The one that ended the alignment.
+    carried: StepState  # What the last step hands on to the next one.
+    # Those of the fit, with the size of the drift between frames once it is measured.
     settings: GaussNewton
-    kappa: float
-    modes: int
-    remaining: int
-    error: float = math.inf
-    chi2: float = math.inf
-    least: tuple[float, float] = NOTHING
+    kappa: float  # Model error that the next step assumes.
+    modes: int  # Number of leading wavefront modes that are free; 0 for the alignment.
+    remaining: int  # Number of steps that may follow.
+    error: float = math.inf  # Model error of `state`.
+    chi2: float = math.inf  # Chi-squared per pixel of `state`.
+    least: tuple[float, float] = NOTHING  # Model error and chi-squared per pixel of `best`.
+    # Companions may not be dropped after some were added to a fit that had stalled, or it might add
+    # and drop them for ever.
     may_drop: bool = True
 
 
@@ -113,23 +93,11 @@ _APART = 0.15
 def bright_companions(
     objective: Objective, state: State, kappa: float, *, most: int, threshold: float
 ) -> list[Planet]:
-    """Find point sources in the residual of the first frame that is not of a reference star.
+    """Find at most `most` point sources in the residual of the first frame of the target.
 
-    Parameters
-    ----------
-    objective : Objective
-    state : State
-    kappa : float
-        Assumed error of the star model, as a fraction of the star.
-    most : int
-        Largest number of companions.
-    threshold : float
-        Smallest S/N, in units of the scatter (median absolute deviation) of the S/N map.
-
-    Returns
-    -------
-    list of Planet
-        Highest S/N first, at the positions of pixels, in the orientation of the first frame.
+    Highest S/N first, at the positions of pixels, in the orientation of the first frame.
+    `threshold` is the smallest S/N, in units of the scatter (median absolute deviation) of the S/N
+    map.
     """
     has_companions = [each.shows_companions for each in state.unknowns.frames]
     if most < 1 or True not in has_companions:
@@ -153,6 +121,12 @@ def bright_companions(
         image = model(forward.coarse_opd(point), **centred).double().cpu().numpy()
     template = unknowns.level("flux", point.vector) * image[::-1, ::-1]
     weight = sigma**-2.0
+    # A matched filter: with the residual r and the template t at a place, the contrast
+    #
+    #     a = sum(r t / sigma^2) / sum(t^2 / sigma^2)
+    #
+    # minimises chi-squared, and its error is the inverse square root of the denominator.
+    # Convolution with the reversed template has these sums at all places.
     numerator = fftconvolve(residual * weight, template, mode="same")
     information = fftconvolve(weight, template**2, mode="same")
     snr = numerator / np.sqrt(np.maximum(information, 1e-300))
@@ -182,13 +156,8 @@ def bright_companions(
 def with_dominant(objective: Objective, state: State, kappa: float) -> State:
     """Add the most significant companion, with levels that follow from star and companion together.
 
-    Parameters
-    ----------
-    objective : Objective
-    state : State
-        Whose companion may outshine what the mask leaves of the star, so that its levels are wrong.
-    kappa : float
-        See `bright_companions`.
+    The state is one whose companion may outshine what the mask leaves of the star, so that its
+    levels are wrong.
     """
     added = bright_companions(objective, state, kappa, most=1, threshold=0.0)
     if not added or state.flux <= 0:
@@ -204,6 +173,8 @@ def with_dominant(objective: Objective, state: State, kappa: float) -> State:
     ]
     k = [each.shows_companions for each in unknowns.frames].index(True)
     valid = problems[k].valid
+    # Least squares of d = F star + L companion + b, in which no noise is assumed, have the flux F
+    # and the contrast L / F.
     columns = torch.stack([stars[k], companions[k], torch.ones_like(stars[k])])[:, valid]
     flux, light, _ = torch.linalg.lstsq(columns.T, problems[k].data[valid]).solution.tolist()
     if min(flux, light) <= 0:
@@ -260,19 +231,9 @@ _MOST = 50
 
 
 def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -> list[Tensor]:
-    """Find pixels that deviate from the model while their neighbours do not.
+    """Find pixels that deviate while their neighbours do not: a mask, (ny, nx), for each frame.
 
-    Parameters
-    ----------
-    objective : Objective
-    state : State
-    linear : LinearModel
-        About the state, with the full weights of all pixels.
-
-    Returns
-    -------
-    list of Tensor of bool, (ny, nx)
-        For every frame.
+    `linear` is about the state, with the full weights of all pixels.
     """
     companions = {k: (point.total - point.star).cpu() for k, point in enumerate(state.points)}
     star_only = linear.without("companions", companions)
@@ -282,6 +243,7 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
         grid = torch.from_numpy(pixel_grid(forward.model, unknowns.values(point.vector)))
         scale = torch.tensor(forward.model.detector.pixelscale, dtype=torch.float64)
         companions_at = unknowns.sources(point.vector)[:, 1:] @ unknowns.turn.T
+        # The rival of a bad pixel is a point source at any of 25 places within a pixel of it.
         steps = torch.linspace(-1.0, 1.0, 5, dtype=torch.float64)
         beside = torch.cartesian_prod(steps, steps) * scale
         mask = torch.zeros(grid.shape[:2], dtype=torch.bool)
@@ -331,6 +293,7 @@ def _amplitude(linear: LinearModel, k: int, templates: Tensor) -> Tensor:
 
 def _explained(linear: LinearModel, k: int, templates: Tensor) -> Tensor:
     """Decrease of chi-squared by each template in frame k, (templates,)."""
+    # The amplitude a = p . Sigma^-1 r / p . Sigma^-1 p lowers chi-squared by a^2 p . Sigma^-1 p.
     products = linear.weigh({k: templates})
     return products.numerator**2 / products.information.clamp(min=1e-300)
 
@@ -347,21 +310,9 @@ def conclude(
     status: Status,
     **about: Any,
 ) -> Refinement:
-    """Compute errors and make the result.
+    """Compute errors about a final state, and make the result; `about` has history and duration.
 
-    Parameters
-    ----------
-    solver : Solver
-    settings : GaussNewton
-        With the prior of the final state.
-    priors : ModePriors
-        With the scales of the final state.
-    state : State
-    kappa : float
-        Error of the star model that errors include, as a fraction of the star.
-    status : Status
-    **about
-        History and duration of the fit.
+    Settings and priors are those of the final state. The errors include the model error `kappa`.
     """
     problems = [forward.problem for forward in solver.objective.forwards]
     modes = len(solver.basis) if settings.wavefront else 0
@@ -508,7 +459,7 @@ class _Fitted:
 
 
 # How the model error decreases. With the data d, the star s, and the noise sigma of a pixel, the
-# error of the star model is the fraction e of the star for which chi-squared per pixel is 1,
+# model error is the fraction e of the star for which chi-squared per pixel is 1,
 #
 #     mean of (d - s)^2 / (sigma^2 + (e s)^2) = 1,
 #
@@ -526,16 +477,7 @@ class _Fitted:
 class Annealing:
     """One fit with a given basis.
 
-    Parameters
-    ----------
-    problems : sequence of Problem
-        One for each frame.
-    settings : GaussNewton
-    basis : Basis
-    warm : mapping of Unknown to float, optional
-        Final values of an earlier fit. The wavefront is then free from the first step.
-    progress : bool
-        Show progress bars.
+    `warm` has the final values of an earlier fit; the wavefront is then free from the first step.
     """
 
     def __init__(
@@ -649,12 +591,10 @@ class Annealing:
         return False
 
     def _restart(self, course: Course, added: Sequence[Planet]) -> None:
-        """Go on with more companions: from here near the solution, else from the alignment.
-
-        Near the solution the model is linear, so that further steps remove the bias of the
-        wavefront.
-        """
+        """Go on with more companions: from here near the solution, else from the alignment."""
         is_close = course.error < _NEAR
+        # Near the solution the model is linear, so that further steps remove the bias of the
+        # wavefront.
         course.state = self._with_companions(course.state if is_close else course.aligned, added)
         course.least, course.remaining = NOTHING, self.settings.max_iterations
         course.may_drop, course.carried = False, course.carried.without_damping()

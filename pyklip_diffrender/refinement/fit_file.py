@@ -53,10 +53,7 @@ _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 def encoded(value: Any) -> Any:
     """Convert settings to JSON types.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For an object of unknown type, such as a user-defined basis.
+    Raises `IncompatibleSetupError` for an object of unknown type, such as a user-defined basis.
     """
     if value is None or isinstance(value, bool | int | str):
         return value
@@ -130,19 +127,10 @@ def text_of(hdus: fits.HDUList, name: str) -> dict[str, Any]:
 def reading(
     path: str | os.PathLike[str], kind: str
 ) -> Iterator[tuple[fits.HDUList, dict[str, Any]]]:
-    """Open a result of this package, with the content of its FACTS extension.
+    """Open a result of the class `kind`, with the content of its FACTS extension.
 
-    Parameters
-    ----------
-    path : path
-    kind : str
-        Name of the class that wrote the file.
-
-    Raises
-    ------
-    CorruptFileError
-        If the file is missing or truncated, was not written by that class, or if a part that is
-        read inside the block is missing or malformed.
+    Raises `CorruptFileError` if the file is missing or truncated, was not written by that class, or
+    if a part that is read inside the block is missing or malformed.
     """
     name = Path(path).name
     with open_fits(path) as hdus:
@@ -167,13 +155,7 @@ def model_facts(model: OpticalSystem) -> dict[str, Any] | None:
 
 
 def model_of(facts: dict[str, Any] | None, name: str) -> OpticalSystem:
-    """Make a model from the arguments of `model_facts`, on the CPU.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the model was not made by `nircam_coronagraph`.
-    """
+    """Make a model from `model_facts`, on the CPU; `IncompatibleSetupError` if there are none."""
     if facts is None:
         raise IncompatibleSetupError(
             f"{name}: the model of this fit was not made by nircam_coronagraph, so it "
@@ -270,10 +252,7 @@ def linear_hdus(linear: LinearModel) -> list[Any]:
 def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
     """Make a linear model from the extensions of `linear_hdus`.
 
-    Raises
-    ------
-    CorruptFileError
-        If its parts are inconsistent.
+    Raises `CorruptFileError` if its parts are inconsistent.
     """
     table = hdus["UNKNOWNS"].data
     unknowns = tuple(

@@ -121,13 +121,7 @@ WHAT_TO_CHECK = (
 
 @contextmanager
 def breakdown_explained(name: str) -> Iterator[None]:
-    """Turn a breakdown of the linear algebra of a fit into a `RefinementError`.
-
-    Parameters
-    ----------
-    name : str
-        Of the frames, for the message.
-    """
+    """Turn a breakdown of a fit's linear algebra into a `RefinementError` that names the frames."""
     try:
         yield
     except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
@@ -281,6 +275,7 @@ class FrameFit:
         values = self.optical_values
         if center is not None:
             ny, nx = model.detector.shape
+            # The place of the star is counted from the middle of the array.
             old = self.observation.center[0] - (np.array(self.observation.shape[::-1]) - 1) / 2
             moved = np.array(center) - (np.array([nx, ny]) - 1) / 2 - old
             shift = torch.from_numpy(moved * np.array(model.detector.pixelscale))

@@ -58,26 +58,11 @@ star."""
 
 
 def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Unknown, float]]:
-    """Return the settings and the starting values with which to continue a fit.
+    """Return the settings, and the starting values, with which to continue a fit.
 
-    The prior has the final scales of the fit, and the companions are those of the fit.
-
-    Parameters
-    ----------
-    fit : Refinement
-    **changes
-        Fields of `GaussNewton` with other values.
-
-    Returns
-    -------
-    settings : GaussNewton
-    warm : dict of Unknown to float
-        Final values of the unknowns.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the fit was read from a file without its linear model.
+    The prior has the final scales of the fit, and the companions are those of the fit; `changes`
+    are other fields of `GaussNewton`. Raises `IncompatibleSetupError` if the fit was read from a
+    file without its linear model.
     """
     settings = fit.settings
     reached = {
@@ -107,17 +92,8 @@ def fit_in_stages(
 ) -> Refinement:
     """Refine with the basis of the settings, or the first default basis that explains the data.
 
-    The `cycles` of the result's settings begin with those of the last basis.
-
-    Parameters
-    ----------
-    problems : sequence of Problem
-        One for each frame.
-    settings : GaussNewton
-    warm : mapping of Unknown to float, optional
-        Starting values.
-    progress : bool
-        Show progress bars.
+    `problems` has one for each frame, and `warm` starting values. The `cycles` of the result's
+    settings begin with those of the last basis.
     """
     pupil = problems[0].model.entrance
     if settings.basis is not None or not settings.cycles:
@@ -144,20 +120,9 @@ def fit_in_stages(
 
 
 def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> Refinement:
-    """Continue a refinement with other settings.
+    """Continue a refinement with other settings: `changes` are fields of `GaussNewton`.
 
-    Parameters
-    ----------
-    fit : Refinement
-    progress : bool
-        Show progress bars.
-    **changes
-        Fields of `GaussNewton` with other values, such as `companions`.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the fit was read from a file without its linear model.
+    Raises `IncompatibleSetupError` if the fit was read from a file without its linear model.
     """
     settings, warm = continue_from(fit, **changes)
     problems = [
@@ -178,25 +143,10 @@ def align_frame(
 ) -> Refinement:
     """Fit place, flux and background of a frame with the wavefront of another fit.
 
-    The Lyot stop, the blur and the internal aberrations are those of the fit, too. Pixels that are
-    bad in all its frames of the same detector pixels are left out.
-
-    Parameters
-    ----------
-    fit : Refinement
-    observation : Observation
-        Of the shape of the fitted frames.
-    settings : GaussNewton
-        Its parameters in `own` are free.
-    systematics : Systematics or None
-        Pattern of the frame.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For a frame that cannot share a fit with those of `fit`.
-    NoValidPixelsError, ShapeError
-        For a frame that does not suit the model.
+    Lyot stop, blur and internal aberrations are those of the fit, and the parameters in
+    `settings.own` are free. Pixels that are bad in all its frames of the same detector pixels are
+    left out. Raises `IncompatibleSetupError` for a frame that cannot share a fit with those of
+    `fit`, and `ShapeError` for one of another shape.
     """
     first = fit.frames[0]
     require_agreement([*(frame.observation for frame in fit.frames), observation])
@@ -217,6 +167,8 @@ def align_frame(
         max_companions=0,
         deviations={n: d for n, d in settings.deviations.items() if n in own},
     )
+    # What is not the frame's own keeps the values of the fit: they are the starting values of
+    # parameters that are not free.
     shared = {
         name: value
         for name, value in first.values.items()
@@ -239,26 +191,12 @@ def join_frames(
 ) -> Refinement:
     """Continue a fit with more frames in its likelihood, such as those of reference stars.
 
-    The wavefront of the fit is near that of the new frames. A few steps of all unknowns then take
-    the place of a fit from the map on.
-
-    Parameters
-    ----------
-    fit : Refinement
-    others : sequence of Refinement
-        New frames, aligned with the fit, see `align_frame`.
-    settings : GaussNewton
-        Those of the fit, with a prior on the drift between frames.
-    systematics : Systematics or None
-        Pattern of all frames.
-    progress : bool
-        Show progress bars.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the fit was read from a file without its linear model.
+    `others` are the new frames, aligned with the fit by `align_frame`; `settings` are those of the
+    fit, with a prior on the drift between frames. Raises `IncompatibleSetupError` if the fit was
+    read from a file without its linear model.
     """
+    # The wavefront of the fit is near that of the new frames. A few steps of all unknowns then take
+    # the place of a fit from the map on.
     settings, reached = continue_from(replace(fit, settings=settings))
     own = (*settings.own, "pedestal")
     count = len(fit.frames)
@@ -430,12 +368,7 @@ def _pixel_area(observation: Observation) -> float | None:
 
 
 def require_calibrated(observation: Observation) -> None:
-    """Refuse frames without photometric calibration.
-
-    Raises
-    ------
-    IncompatibleSetupError
-    """
+    """Raise `IncompatibleSetupError` for a frame without photometric calibration."""
     if _pixel_area(observation) is None:
         raise IncompatibleSetupError(
             f"star_flux: {observation.name} is not calibrated: expected a frame of NIRCam in units "
@@ -444,20 +377,15 @@ def require_calibrated(observation: Observation) -> None:
 
 
 def jansky_per_unit(frame: FrameFit) -> float | None:
-    """Flux density, Jy, of a star of flux 1 in the unit of a fit.
+    """Flux density, Jy, of a star of flux 1 in the unit of a fit; None without calibration.
 
-    The fitted flux is the light that the entrance pupil collects, in the unit of the pixels. What
-    the pipeline calibrates is the light of a source far from the occulter, all of its image
-    through the Lyot stop. That is the fitted flux times the transmission of the stop, times the
-    solid angle of a pixel for which the pipeline calculated its surface brightness (PIXAR_SR).
-
-    Returns
-    -------
-    float or None
-        None for frames that are not NIRCam's, that are not in units of surface brightness, or
-        whose header has no PIXAR_SR.
+    Only frames of NIRCam in units of surface brightness, with PIXAR_SR in their header, have one.
     """
     area = _pixel_area(frame.observation)
+    # The fitted flux is the light that the entrance pupil collects, in the unit of the pixels. What
+    # the pipeline calibrates is the light of a source far from the occulter, all of its image
+    # through the Lyot stop. That is the fitted flux times the transmission of the stop, times the
+    # solid angle of a pixel for which the pipeline calculated its surface brightness (PIXAR_SR).
     if area is None:
         return None
     # A tensor, because the wavefront is complex where the pupil's amplitude was fitted.
@@ -469,10 +397,7 @@ def jansky_per_unit(frame: FrameFit) -> float | None:
 def to_jansky(star_flux: float | str | u.Quantity) -> float:
     """Flux density of a star in Jy, from a number of Jy, a Quantity, an AB magnitude or text.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For anything that is not a positive flux density.
+    Raises `IncompatibleSetupError` for anything that is not a positive flux density.
     """
     try:
         value = star_flux if isinstance(star_flux, u.Quantity) else u.Quantity(star_flux)
@@ -497,32 +422,17 @@ def with_star_flux(
     held: float = _HELD,
     progress: bool = False,
 ) -> Refinement:
-    """Continue a fit with the flux of the star held at that of a catalogue.
+    """Continue a fit of one star with its flux held at that of a catalogue, Jy in the filter.
 
-    The wavefront then makes up for the change of the diffracted light, so that contrasts refer to
-    the catalogue's star.
-
-    Parameters
-    ----------
-    fit : Refinement
-        Of one star.
-    star_flux : float
-        Flux density in the filter, Jy.
-    error : float
-        Its relative standard deviation, which errors of contrasts then include.
-    held : float
-        Relative deviation from it that the first fit allows.
-    progress : bool
-        Show progress bars.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the frames have no photometric calibration.
+    `error` is the relative standard deviation of the catalogue's flux, which errors of contrasts
+    then include; `held` is the relative deviation from it that the first fit allows. Raises
+    `IncompatibleSetupError` if the frames have no photometric calibration.
     """
     for frame in fit.frames:
         require_calibrated(frame.observation)
     for _ in range(_ROUNDS):
+        # The wavefront makes up for the change of the diffracted light, so that contrasts refer to
+        # the catalogue's star.
         frames = [
             replace(frame, start={**frame.start, "flux": star_flux / _scale(frame)})
             for frame in fit.frames

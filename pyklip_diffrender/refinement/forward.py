@@ -47,30 +47,15 @@ _SCALE_TOLERANCE = 0.02
 
 @dataclass
 class Problem:
-    """One star image to be explained.
-
-    Frames of an observation that share star and wavefront are averaged first, with their
-    inverse variances as weights.
-
-    Attributes
-    ----------
-    model : OpticalSystem
-    observation : Observation
-        Before the frames are averaged.
-    initial : OPDMap
-        Starting wavefront.
-    start : dict
-        Starting values of optical parameters (numbers in the units of the parameter table, or
-        Quantities), and of "flux" and "background" where known.
-    systematics : Systematics, optional
-        Flat-field pattern of these pixels, with its error.
-    """
+    """One star image to be explained, averaged over the frames of an observation."""
 
     model: OpticalSystem
-    observation: Observation
-    initial: OPDMap
+    observation: Observation  # Before its frames are averaged.
+    initial: OPDMap  # Starting wavefront.
+    # Starting values of optical parameters (numbers in the units of the parameter table, or
+    # Quantities), and of "flux" and "background" where known.
     start: dict[str, Any] = dataclasses.field(default_factory=dict)
-    systematics: Systematics | None = None
+    systematics: Systematics | None = None  # Flat-field pattern of these pixels, with its error.
 
     def __post_init__(self) -> None:
         if self.observation.shape != self.model.detector.shape:
@@ -86,6 +71,8 @@ class Problem:
         for name in {"flux", "background"} & self.start.keys():
             unit = self.observation.unit
             self.start[name] = to_number(self.start[name], unit, f"start: {name}")
+        # The frames share star and wavefront: their mean, weighted by their inverse variances,
+        # takes their place.
         combined = self.observation.combined()
         device = self.model.device
         self.data = torch.from_numpy(combined.data[0]).to(device)
@@ -157,6 +144,9 @@ class Problem:
         A parameter that is not in `names` keeps its start (flux must then have been given).
         """
         weight = torch.where(self.valid, sigma**-2, 0.0)
+        # With the rows M of the free levels (image, 1) and W = 1 / sigma^2, the values that
+        # minimise the sum of W (d - M^T v)^2 solve (M W M^T) v = M W d; what is not free is
+        # subtracted from d.
         flux = float(self.start.get("flux", 0.0))
         level = float(self.start.get("background", 0.0))
         columns = []
@@ -182,14 +172,10 @@ class Problem:
 
 
 def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
-    """Compare filter, masks, module and pixel scale of a model with those of the frames.
+    """Refuse frames with another filter, mask, module or pixel scale than the model's.
 
     Settings that are unknown on either side, such as those of a system that is not an instrument,
-    are not compared.
-
-    Raises
-    ------
-    IncompatibleSetupError
+    are not compared. Raises `IncompatibleSetupError`.
     """
     setup, header = model.setup, observation.header
     setups = (
@@ -239,35 +225,18 @@ _DIFFERENCE = 5e-4
 
 @dataclass(frozen=True)
 class Point:
-    """Values of the unknowns of a frame, and what they render.
-
-    Attributes
-    ----------
-    unknowns : FrameUnknowns
-    vector : Tensor
-    opd : Tensor, (npix, npix)
-        m; complex where the pupil's amplitude is free.
-    fields : list of Tensor
-        The star's field at each wavelength, at flux 1.
-    image : Tensor, (ny, nx)
-        The star at flux 1.
-    light : Tensor, (ny, nx)
-        The star in the data's unit, with the known flat-field pattern (also that of the
-        pedestal, see `Systematics`).
-    star : Tensor, (ny, nx)
-        The star and the background.
-    total : Tensor, (ny, nx)
-        With the companions.
-    """
+    """Values of the unknowns of a frame, and what they render."""
 
     unknowns: FrameUnknowns
-    vector: Tensor
-    opd: Tensor
-    fields: list[Tensor]
-    image: Tensor
+    vector: Tensor  # (unknowns,).
+    opd: Tensor  # (npix, npix), m; complex where the pupil's amplitude is free.
+    fields: list[Tensor]  # The star's field at each wavelength, at flux 1.
+    image: Tensor  # (ny, nx), the star at flux 1.
+    # (ny, nx), the star in the data's unit, with the known flat-field pattern, also that of the
+    # pedestal, see `Systematics`.
     light: Tensor
-    star: Tensor
-    total: Tensor
+    star: Tensor  # (ny, nx), the star and the background.
+    total: Tensor  # (ny, nx), with the companions.
 
     @property
     def multiplied(self) -> Tensor:
@@ -276,14 +245,7 @@ class Point:
 
 
 class Forward:
-    """Renders points, and linearises about them.
-
-    Parameters
-    ----------
-    problem : Problem
-    responses : ResponseCache
-        Of the model to the basis; shared by frames.
-    """
+    """Renders points, and linearises about them; frames share the responses."""
 
     def __init__(self, problem: Problem, responses: ResponseCache) -> None:
         self.problem, self.model = problem, problem.model
@@ -300,6 +262,8 @@ class Forward:
             change = self.basis.opd(coefficients * NANOMETRE, grid)
             opd = opd + change.to(self.model.device)
         amplitude = vector[unknowns.where("amplitude")]
+        # With an OPD o + i b the field is exp(i k o) exp(-k b): a positive imaginary part dims the
+        # pupil. Amplitude coefficients are those of modes of -i nm, and positive ones brighten it.
         if not len(amplitude):
             return opd
         padded = torch.zeros(len(self.basis), dtype=torch.float64)
@@ -312,14 +276,9 @@ class Forward:
         return downsample(point.opd, self.coarse.npix)
 
     def at(self, unknowns: FrameUnknowns, vector: Tensor, rendered: Tensor | None = None) -> Point:
-        """Render a point.
+        """Render a point, whose `total` has the companions of the mask `rendered` (companions,).
 
-        Parameters
-        ----------
-        unknowns : FrameUnknowns
-        vector : Tensor
-        rendered : Tensor of bool, (companions,), optional
-            Which of the companions are part of `total`; default those that the frame shows.
+        By default these are those that the frame shows.
         """
         values, opd = unknowns.values(vector), self.opd(unknowns, vector)
         flux = unknowns.level("flux", vector)
@@ -346,11 +305,7 @@ class Forward:
     def sources(self, point: Point, offsets: Tensor) -> Tensor:
         """Images of point sources of contrast 1, (k, ny, nx), in the data's unit.
 
-        Parameters
-        ----------
-        point : Point
-        offsets : Tensor, (k, 2)
-            x, y from the star, arcsec, in the orientation of this frame.
+        `offsets` (k, 2) are x, y from the star, arcsec, in the orientation of this frame.
         """
         values = self._towards(point.unknowns.values(point.vector), offsets)
         with torch.no_grad():
@@ -368,8 +323,8 @@ class Forward:
         """Derivative of `total`, (unknowns, ny, nx), float32, on the CPU.
 
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront. The
-        light of companions that are faint, or that an error `kappa` of the star model outweighs,
-        counts as independent of optics and wavefront. `reading` takes the derivatives of the field.
+        light of companions that are faint, or that a model error `kappa` outweighs, counts as
+        independent of optics and wavefront. `reading` takes the derivatives of the field.
         """
         reading = self.responses.reading() if reading is None else reading
         unknowns, bright = point.unknowns, point.unknowns.bright_sources(point.vector, kappa)
@@ -430,6 +385,9 @@ class Forward:
         """
         unknowns, vector = point.unknowns, point.vector
         flux, gain = unknowns.level("flux", vector), self.problem.gain
+        # With the images S of the star and p_k of companions at flux 1, and the pattern g,
+        #
+        #     total = F (g S + sum_k c_k p_k) + background + pedestal (g - 1).
         by_level = {
             "flux": gain * point.image,
             "background": torch.ones_like(point.image),
@@ -448,33 +406,24 @@ class Forward:
             with torch.no_grad():
                 rows.append((flux * self.coarse(opd, **values)).float().cpu())
             moved = self._position_slopes(opd, values)
+            # The place in this frame is R x, so that the derivative by x is R^T times that by the
+            # place.
             turned = torch.tensordot(unknowns.turn.T, moved, dims=1)
             rows += list((flux * source[0] * turned).float())
         return torch.stack(rows) if rows else torch.zeros(0, *point.image.shape)
 
     def slopes(self, point: Point, pixels: Tensor, companions: Tensor) -> dict[str, Tensor]:
-        """Derivatives of ``(pixels * image).sum()`` through the model itself.
+        """Derivatives of ``(pixels * image).sum()`` through the model itself, by name of unknowns.
 
-        They take as long as two or three images, by reverse mode at one wavelength after the other.
-        `jacobian` has those of a coarse copy at fewer wavelengths, with an error that exceeds a
-        gradient near its zero, and without the light of faint companions. `levels` has the
-        derivatives by the other unknowns.
-
-        Parameters
-        ----------
-        point : Point
-        pixels : Tensor, (ny, nx)
-        companions : Tensor, (k, 3)
-            Those that the image shows besides the star.
-
-        Returns
-        -------
-        dict of str to Tensor
-            float64, on the CPU: by the optical parameters, the modes, and the amplitude if it is
-            free.
+        `pixels` is (ny, nx), and `companions` (k, 3) are those that the image shows besides the
+        star. Names are optical parameters, "modes" and, if it is free, "amplitude"; values are
+        float64 on the CPU. `levels` has the derivatives by the other unknowns.
         """
         unknowns = point.unknowns
         names = unknowns.optical
+        # They take as long as two or three images, by reverse mode at one wavelength after the
+        # other. `jacobian` has those of a coarse copy at fewer wavelengths, with an error that
+        # exceeds a gradient near its zero, and without the light of faint companions.
         lights = self._lights(point, companions)
         totals = [
             torch.stack(parts).sum(dim=0)
@@ -485,6 +434,8 @@ class Forward:
         by_name = dict(zip(names, totals[1:], strict=True))
         result = {name: slope.double().cpu().flatten() for name, slope in by_name.items()}
         result["modes"] = self._by_modes(totals[0].real)
+        # For a real number L, torch's gradient G by a complex OPD means dL = Re(conj(G) dOPD). A
+        # unit of amplitude is dOPD = -i, so that its derivative is -Im(G).
         if totals[0].is_complex():
             result["amplitude"] = -self._by_modes(totals[0].imag)[: unknowns.amplitude_modes]
         return result
@@ -494,6 +445,12 @@ class Forward:
         pixels: Tensor,
     ) -> list[Tensor]:  # fmt: skip
         """Derivatives of ``(pixels * image).sum()`` of one source by OPD and optical parameters."""
+        # The light on the detector's samples is sum_l w_l |E_l|^2, so that with G = dL / dlight
+        #
+        #     dL = sum_l Re(conj(2 w_l G E_l) dE_l) + the part of the detector's own parameters.
+        #
+        # The fields E_l are known, so that each wavelength can be propagated again and
+        # differentiated alone: memory is needed for one of them at a time.
         model, names, spectrum = self.model, point.unknowns.optical, self.model.bandpass
         values = model.values(values)
         inputs = [each.detach().clone() for each in (point.opd, *(values[n] for n in names))]
@@ -548,15 +505,7 @@ _MAX_KAPPA = 10.0
 
 @dataclass(frozen=True)
 class State:
-    """Values of all unknowns and the images that they render.
-
-    Attributes
-    ----------
-    unknowns : Unknowns
-    vector : Tensor, (unknowns,)
-    points : tuple of Point
-        One for each frame.
-    """
+    """Values of all unknowns, a vector (unknowns,), and the points that they render, by frame."""
 
     unknowns: Unknowns
     vector: Tensor
@@ -578,24 +527,16 @@ class State:
 
 
 class Objective:
-    """Compares states with the data of all frames.
+    """Compares states with the data of all frames, each with its `Forward`.
 
-    Parameters
-    ----------
-    forwards : sequence of Forward
-        One for each frame.
-    robust : float
-        Residuals of this many sigma have half the weight (Cauchy's loss); inf for least squares.
-
-    Attributes
-    ----------
-    shares_pattern : tuple of bool
-        Which frames show the same pixels of the detector, so that the error of the systematics is
-        one unknown in all of them. It is noise of every other frame.
+    `robust` is the residual in standard deviations with half the weight (Cauchy's loss); inf for
+    least squares.
     """
 
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
+        # Which frames show the same pixels of the detector, so that the error of the systematics is
+        # one unknown in all of them. It is noise of every other frame.
         self.shares_pattern = _sharing([forward.problem for forward in self.forwards])
         self.robust = robust
 
@@ -629,16 +570,7 @@ class Objective:
         return torch.where(problem.valid, (problem.data - point.total) / sigma, 0.0)
 
     def errors(self, state: State, kappa: float, robust: float) -> Noise:
-        """Noise of all frames, made robust about a state.
-
-        Parameters
-        ----------
-        state : State
-        kappa : float
-            Assumed error of the star model, as a fraction of the star.
-        robust : float
-            Residual, in standard deviations, of half weight; inf for least squares.
-        """
+        """Noise of all frames with the model error `kappa`, made robust about a state."""
         weights = []
         for k, point in enumerate(state.points):
             problem = self.forwards[k].problem
@@ -649,11 +581,14 @@ class Objective:
             if math.isfinite(robust):
                 # Outliers show against all errors, that of the pattern included.
                 residual = self.whitened(k, point, whole)
+                # Cauchy's loss b^2 log(1 + (r/b)^2) has the weight 1 / (1 + (r/b)^2) at residual r.
                 weight = weight * torch.rsqrt(1 + (residual / robust) ** 2)
             weights.append(weight)
         common = [torch.zeros_like(weight) for weight in weights]
         sharing = [k for k, shares in enumerate(self.shares_pattern) if shares]
         if sharing:
+            # c = s g / sqrt(1 + g^2 sum_f w_f^2 s_f^2), see `Noise`, with the light s that is
+            # multiplied and the error g of the pattern.
             error = self.forwards[sharing[0]].problem.gain_error
             light = {k: state.points[k].multiplied for k in sharing}
             seen = sum((weights[k] * light[k]) ** 2 for k in sharing)
@@ -689,6 +624,8 @@ class Objective:
             noises.append(self.noise(k, point)[valid] ** 2)
             stars.append(point.total[valid] ** 2)
         residual, noise, star = torch.cat(residuals), torch.cat(noises), torch.cat(stars)
+        # The mean of r^2 / (n^2 + kappa^2 s^2) falls with kappa, so that bisection finds the kappa
+        # at which it is 1.
         if float((residual / noise).mean()) <= 1:
             return 0.0
         low, high = 0.0, _MAX_KAPPA
@@ -713,6 +650,7 @@ def _sharing(problems: Sequence[Problem]) -> tuple[bool, ...]:
         for place, problem in zip(places, problems, strict=True)
         if place[0] is not None and bool((problem.gain_error > 0).any())
     ]
+    # Frames that show the same pixels have the same first pixel, shape and systematics.
     most = max(known, key=known.count, default=None)
     if most is None or known.count(most) < 2:
         return (False,) * len(problems)

@@ -55,7 +55,9 @@ _SWITCHES = (
 """Fields of `GaussNewton` that are True or False."""
 
 _SHARES = ((100.0, 0.4), (4.0, 0.55), (0.0, 0.85))
-"""Share of the spatial frequencies that a first look fits, by how much fainter the star is."""
+"""Share of the spatial frequencies that a first look fits, by how many times the star is fainter
+than G 7-34, compared with its noise. In one roll of that star, limits were 0.94 to 1.07 times those
+of the full fit; other stars were not measured."""
 
 _PROCESS = 1.3e9
 """Memory that the package and PyTorch take, with what a fit needs for a while, bytes."""
@@ -415,12 +417,7 @@ def settings_for(observation: Observation) -> GaussNewton:
 
 
 def quick_settings(observation: Observation) -> GaussNewton:
-    """Settings for a first look: `settings_for` with fewer modes and coarser derivatives.
-
-    Of a star as bright as G 7-34 and its noise, the fit has 0.85 of the spatial frequencies; of one
-    that is four times fainter 0.55, and 0.4 of one that is a hundred times fainter. In one roll of
-    G 7-34, limits were 0.94 to 1.07 times those of the full fit; other stars were not measured.
-    """
+    """Settings for a first look: `settings_for` with fewer modes and coarser derivatives."""
     settings, faint = settings_for(observation), faintness(observation)
     share = next(share for least, share in _SHARES if faint >= least)
     cycles = tuple(float(max(4, round(share * each))) for each in settings.cycles)
@@ -432,14 +429,7 @@ def quick_settings(observation: Observation) -> GaussNewton:
 
 
 def nircam_settings(observation: Observation, **changes: Any) -> GaussNewton:
-    """Return the NIRCam preset for an observation's filter, mask and module.
-
-    Parameters
-    ----------
-    observation : Observation
-    **changes
-        See `GaussNewton.nircam`.
-    """
+    """Return the preset `GaussNewton.nircam` for an observation's filter, mask and module."""
     header, name = observation.header, observation.name
     mask = image_mask(header, name)
     return GaussNewton.nircam(

@@ -66,16 +66,11 @@ _SAME_ROLL = 1.0
 
 
 def exposure_sequences(observations: Sequence[Observation]) -> list[int]:
-    """Number the exposure sequences that observations belong to.
+    """Number the exposure sequence of every observation, from 0 in the order of first appearance.
 
     Frames of one star at one roll, each begun at most two hours after another one, are of one
-    sequence: the small-grid dithers of a reference star, for example. There is no slew between
-    them. Frames of which date or angle are not known belong to every sequence of their star.
-
-    Returns
-    -------
-    list of int
-        For every observation, from 0 in the order of first appearance.
+    sequence, such as small-grid dithers. Frames of which date or angle are not known belong to
+    every sequence of their star.
     """
     numbers: list[int] = []
     for k, each in enumerate(observations):
@@ -105,34 +100,18 @@ def count_modes_below(basis: Basis, cycles: float) -> int:
 
 @dataclass(frozen=True)
 class ModePriors:
-    """Gaussian priors about zero.
+    """Gaussian priors about zero on the modes: amplitude, wavefront and blocks of drift."""
 
-    Attributes
-    ----------
-    amplitude : Tensor, (amplitude modes,)
-        Standard deviations, nm of an imaginary OPD.
-    drift : int
-        Number of leading modes of the wavefront that may differ between frames.
-    blocks : tuple of tuple of int
-        For every frame, the blocks of drift that its wavefront has: the first is that of its
-        exposure sequence or, where frames of a sequence share none, its own.
-    shape : Tensor, (modes + blocks * drift,)
-        Standard deviations of the wavefront's modes relative to the scale of their group.
-    group : Tensor, (modes + blocks * drift,), int64
-        Index of the group.
-    names : tuple of str
-        Names of the groups.
-    scales : Tensor, (groups,)
-        nm. A step of a fit returns others unless they are fixed.
-    """
-
-    amplitude: Tensor
-    drift: int
+    amplitude: Tensor  # (amplitude modes,), standard deviations, nm of an imaginary OPD.
+    drift: int  # Number of leading modes of the wavefront that may differ between frames.
+    # For every frame, the blocks of drift that its wavefront has: first that of its exposure
+    # sequence or, where frames of a sequence share none, its own.
     blocks: tuple[tuple[int, ...], ...]
+    # (modes + blocks * drift,), standard deviations relative to the scale of the group.
     shape: Tensor
-    group: Tensor
+    group: Tensor  # (modes + blocks * drift,), int64, index of the group in `names`.
     names: tuple[str, ...]
-    scales: Tensor
+    scales: Tensor  # (groups,), nm; a step of a fit returns others unless they are fixed.
 
     @classmethod
     def of(
@@ -149,6 +128,10 @@ class ModePriors:
             if dither is not None:
                 sequences = exposure_sequences(observations)
             blocks = [[number] for number in sequences]
+            # A frame's wavefront is the shared one, plus the block of its exposure sequence
+            # (`drift`), plus a block of its own (`dither`) where the sequence has other frames.
+            # Blocks are numbered in this order, and each repeats the leading modes of the shared
+            # wavefront.
             kinds = [(drift, "drift", 1 + max(sequences))]
             if dither is not None:
                 many = [k for k, each in enumerate(sequences) if sequences.count(each) > 1]
@@ -186,13 +169,7 @@ class ModePriors:
         return max(of_wavefront, default=0.0) >= _IMPROBABLE
 
     def ratios(self, update: EvidenceUpdate) -> dict[str, float]:
-        """Size of the fitted modes relative to their priors, by group.
-
-        Parameters
-        ----------
-        update : EvidenceUpdate
-            Of all unknowns of the fit, with their variances.
-        """
+        """Size of the fitted modes relative to their priors, by group, from all unknowns."""
         assert update.variance is not None
         amplitude = torch.zeros(len(self.amplitude), dtype=torch.int64)
         group = torch.cat([amplitude, self.group + 1])
@@ -215,12 +192,8 @@ def first_unknowns(
 ) -> Unknowns:
     """The unknowns of frames that are fitted together, before companions are added.
 
-    Flux and background start at their best estimates for the starting wavefront.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the flux has a prior deviation but no starting value.
+    Flux and background start at their best estimates for the starting wavefront. Raises
+    `IncompatibleSetupError` if the flux has a prior deviation but no starting value.
     """
     origin = forwards[0].problem.observation
     frames = tuple(
@@ -292,51 +265,27 @@ def _median_flux(problem: Problem, image: Tensor) -> float:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of a state, for the unknowns minus their starting values.
-
-    Attributes
-    ----------
-    state : State
-    kappa : float
-        Assumed error of the star model, as a fraction of the star.
-    robust : float
-        Residual, in standard deviations, of half weight; inf for least squares.
-    curvature : Tensor, (unknowns, unknowns)
-        J C^-1 J^T, with the Jacobian J and the covariance C of the noise, see `Noise`.
-    gradient : Tensor, (unknowns,)
-        J C^-1 r, with the residual r at the starting values.
-    current : Tensor, (unknowns,)
-        Unknowns of the state minus their starting values.
-    frames : tuple of LinearFrame
-    bright_companions : int
-        Number of companions, over all frames, that count in the Jacobians.
-    error : float
-        Largest error of the derivatives, as that of a `Reading`.
-    has_weights : bool
-        Whether curvature and gradient have the present weights of the pixels. If not, only the
-        Jacobians can be used again, and the curvature to precondition.
-    """
+    """Normal equations of a state, for the unknowns minus their starting values."""
 
     state: State
-    kappa: float
-    robust: float
-    curvature: Tensor
-    gradient: Tensor
-    current: Tensor
+    kappa: float  # Model error.
+    robust: float  # Residual of half weight, standard deviations; inf for least squares.
+    curvature: Tensor  # (unknowns, unknowns), J C^-1 J^T, see `Noise`.
+    gradient: Tensor  # (unknowns,), g = J C^-1 r with the residual r at the starting values.
+    current: Tensor  # (unknowns,), unknowns of the state minus their starting values.
     frames: tuple[LinearFrame, ...]
-    bright_companions: int
-    error: float = 0.0
+    bright_companions: int  # Number of companions, over all frames, that count in the Jacobians.
+    error: float = 0.0  # Largest error of the derivatives, as that of a `Reading`.
+    # Whether curvature and gradient have the present weights of the pixels. If not, only the
+    # Jacobians can be used again, and the curvature to precondition.
     has_weights: bool = True
 
 
 def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """G G^T and G r of the whitened Jacobian G = jacobian * weight.
 
-    Parameters
-    ----------
-    jacobian : Tensor, (rows, pixels), float32
-    weight, residual : Tensor, (pixels,), float64
-        The residual is whitened.
+    `jacobian` is (rows, pixels), float32; `weight` and the whitened `residual` are (pixels,),
+    float64.
     """
     count = len(jacobian)
     gradient = torch.zeros(count, dtype=torch.float64)
@@ -360,28 +309,21 @@ def linearise(
     outweighing: float = 0.0,
     reading: Reading | None = None,
 ) -> NormalEquations:
-    """Linearise all frames about a state.
+    """Linearise all frames about a state, with its first `modes` modes.
 
-    Parameters
-    ----------
-    objective : Objective
-    state : State
-    kappa : float
-        Assumed error of the star model, as a fraction of the star.
-    modes : int
-        Number of leading wavefront modes that are free; all of them if the wavefront drifts
-        between frames, 0 for the alignment only.
-    robust : float
-        Residual, in standard deviations, of half weight; inf for least squares.
-    jacobians : sequence of Tensor, optional
-        Jacobians of all frames at this state, if they are known.
-    outweighing : float
-        Error of the star model, as a fraction of the star, that decides which companions count in
-        the Jacobians, see `brightest`.
-    reading : Reading, optional
-        Takes the derivatives of the field, where the Jacobians are not known.
+    `jacobians` are those of all frames at this state, if they are known; otherwise `reading` takes
+    the derivatives of the field. The model error `outweighing` decides which companions count in
+    them, see `brightest`. A wavefront that drifts between frames needs all modes.
     """
     size = state.unknowns.with_modes(modes)
+    # S_f distributes the rows of frame f onto the unknowns: that of a leading mode to the shared
+    # mode and to its blocks of drift. With the Jacobians J_f by row and W = diag(w^2),
+    #
+    #     A = sum_f S_f J_f W_f J_f^T S_f^T - R R^T,    R = sum_f S_f J_f W_f c_f  by pixel,
+    #     g = sum_f S_f J_f (C^-1 r)_f + A x0.
+    #
+    # R R^T is what C^-1 = W - W c c^T W subtracts where frames share a pattern, see `Noise`. A x0
+    # takes the residual r of the state to the starting values, where x0 is `current`.
     current = (state.vector - state.unknowns.initial())[:size]
     curvature = torch.zeros(size, size, dtype=torch.float64)
     gradient = torch.zeros(size, dtype=torch.float64)
@@ -442,19 +384,7 @@ than the rounding errors of single precision."""
 
 
 class ModelDerivatives:
-    """Gradient and curvature of chi-squared, by derivatives of the model itself.
-
-    The gradient is that of all light. In the curvature, which determines the path to the minimum
-    and not its place, the light of faint companions is linear: it depends on their contrasts and
-    positions and on the star's flux, and not on the wavefront.
-
-    Parameters
-    ----------
-    objective : Objective
-    state : State
-    noise : Noise
-        Of all frames.
-    """
+    """Gradient and curvature of chi-squared, by derivatives of the model itself."""
 
     def __init__(self, objective: Objective, state: State, noise: Noise) -> None:
         self._objective, self._state, self._noise = objective, state, noise
@@ -463,6 +393,9 @@ class ModelDerivatives:
             for forward, point in zip(objective.forwards, state.points, strict=True)
         ]
         self._bright = [point.unknowns.are_bright(point.vector) for point in state.points]
+        # The gradient is that of all light. In the curvature, which determines the path to the
+        # minimum and not its place, the light of faint companions is linear: it depends on their
+        # contrasts and positions and on the star's flux, and not on the wavefront.
         self._without_faint = [
             point if bool(bright.all()) else forward.at(point.unknowns, point.vector, bright)
             for forward, point, bright in zip(
@@ -477,6 +410,8 @@ class ModelDerivatives:
 
     def product(self, step: Tensor) -> Tensor:
         """Product of the curvature with a step, (unknowns,)."""
+        # A s = J C^-1 (J^T s): a difference of two images along the step s has J^T s, and `_pull`
+        # applies J C^-1 in reverse mode.
         vector, images, sources = self._state.vector + _DIFFERENCE * step, {}, []
         for k, before in enumerate(self._without_faint):
             rows, bright = self._state.unknowns.rows[k], self._bright[k]
@@ -512,6 +447,8 @@ class ModelDerivatives:
         for k, (forward, point) in enumerate(
             zip(objective.forwards, self._state.points, strict=True)
         ):
+            # `inverse` has C^-1 x over w. Levels and companions have images in `_levels`, and the
+            # derivatives by the other unknowns come from reverse mode.
             pixels = self._noise.weight[k] * whitened[k]
             where, levels = point.unknowns.slices, self._levels[k]
             of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
@@ -533,29 +470,16 @@ def accurate_step(
     iterations: int = _ITERATIONS,
     sufficient: float = _SUFFICIENT,
 ) -> tuple[Tensor, bool]:
-    """Compute the step to the minimum of the linearised penalised chi-squared.
+    """Compute the step (unknowns,) to the minimum of the linearised penalised chi-squared.
 
-    Parameters
-    ----------
-    derivatives : ModelDerivatives
-    curvature : Tensor, (some, some)
-        Approximate curvature by the leading unknowns, the only ones that the step changes.
-    offset : Tensor, (unknowns,)
-        Unknowns of the state minus the means of their priors.
-    deviation : Tensor, (unknowns,)
-        Prior standard deviations.
-    enough : float
-        Decrease of the penalised chi-squared that does not matter.
-    iterations, sufficient
-        See `conjugate_gradients`.
-
-    Returns
-    -------
-    step : Tensor, (unknowns,)
-    settled : bool
-        Whether another iteration would hardly have lowered chi-squared.
+    `curvature` (some, some) is approximate and by the leading unknowns, the only ones that the step
+    changes. `offset` (unknowns,) is from the means of the priors, whose standard deviations are
+    `deviation`. The flag and the last arguments are those of `conjugate_gradients`.
     """
     count = len(curvature)
+    # The step s minimises s (A + p) s - 2 s (g - p x0), with the curvature A and gradient g of the
+    # model itself, the priors' precision p, and the offset x0 from their means. A + p is known by
+    # its products with vectors, and the approximate curvature preconditions it.
     precision = deviation[:count] ** -2
     # Unknowns differ by many powers of ten, so the system is solved in scaled units.
     unit = (curvature.diagonal() + precision).clamp(min=1e-300) ** -0.5
@@ -587,41 +511,16 @@ def conjugate_gradients(
     iterations: int = _ITERATIONS,
     sufficient: float = _SUFFICIENT,
 ) -> tuple[Tensor, bool]:
-    """Minimise x A x - 2 g x approximately.
+    """Minimise x A x - 2 g x approximately; also whether another iteration would hardly lower it.
 
-    Every iteration lowers it, however poor the preconditioner is; a few are sufficient where that
-    is wrong in a few directions only. SciPy's `cg` ends by the size of the gradient, which says
-    little where unknowns are nearly degenerate.
-
-    Parameters
-    ----------
-    product : callable
-        A x, with a positive definite matrix A.
-    precondition : callable
-        B^-1 x, with an approximation B to A.
-    gradient : Tensor, (n,)
-        g.
-    enough : float
-        Decrease below which that of one iteration is the last.
-    iterations : int
-        Largest number of iterations.
-    sufficient : float
-        Part of the whole decrease below which that of one iteration is the last.
-
-    Returns
-    -------
-    x : Tensor, (n,)
-    settled : bool
-        Whether another iteration would hardly have lowered it.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from pyklip_diffrender.refinement.solver import conjugate_gradients
-    >>> matrix = torch.tensor([[2.0, 1.0], [1.0, 3.0]])
-    >>> conjugate_gradients(lambda x: matrix @ x, lambda x: x, torch.tensor([3.0, 4.0]))
-    (tensor([1.0000, 1.0000]), True)
+    `product` gives A x with a positive definite A, `precondition` B^-1 x with an approximation B to
+    A, and `gradient` g is (n,). The iteration is the last whose decrease is below `enough`, or
+    below the part `sufficient` of the whole decrease.
     """
+    # Along a direction p, with the remaining gradient r = g - A x and z = B^-1 r, the minimum is at
+    # the length (r . z) / (p . A p) and lowers the function by (r . z)^2 / (p . A p), since r is
+    # orthogonal to the earlier directions. Every iteration lowers it, however poor the
+    # preconditioner is; a few are sufficient where that is wrong in a few directions only.
     x = torch.zeros_like(gradient)
     remaining = gradient.clone()
     direction = precondition(remaining)
@@ -639,6 +538,8 @@ def conjugate_gradients(
         remaining -= power / curvature * pulled
         decrease = power**2 / curvature
         total += decrease
+        # SciPy's `cg` ends by the size of the gradient, which says little where unknowns are nearly
+        # degenerate.
         if decrease < max(sufficient * total, enough):
             return x, True
         ahead = precondition(remaining)
@@ -702,23 +603,12 @@ _POOR = 0.5
 
 @dataclass(frozen=True)
 class StepState:
-    """What one step of a fit hands on to the next.
+    """What one step of a fit hands on to the next."""
 
-    Attributes
-    ----------
-    priors : ModePriors
-        With the scales that the step has fitted, unless they are fixed.
-    damping : float
-        Levenberg-Marquardt damping of the next step.
-    kappa : float
-        Model error that the step has assumed, as a fraction of the star.
-    needs_accurate : bool
-        Whether the next step needs derivatives of the model itself, unless kappa grows.
-    """
-
-    priors: ModePriors
-    damping: float = 0.0
-    kappa: float = math.inf
+    priors: ModePriors  # With the scales that the step has fitted, unless they are fixed.
+    damping: float = 0.0  # Levenberg-Marquardt damping of the next step.
+    kappa: float = math.inf  # Model error that the step has assumed.
+    # Whether the next step needs derivatives of the model itself, unless kappa grows.
     needs_accurate: bool = False
 
     def without_damping(self) -> StepState:
@@ -743,25 +633,13 @@ class Step(NamedTuple):
 
 
 class EquationsCache:
-    """The last normal equations of a fit, which are its largest arrays.
-
-    There is only one set, because the next one is as large: it is freed before others are computed.
-    Its Jacobians are used again at the same state, and its curvature preconditions accurate steps
-    from states near it. What it returns has the error of derivatives that the caller allows.
-
-    Parameters
-    ----------
-    objective : Objective
-    responses : ResponseCache
-        Of the frames of the objective.
-
-    Attributes
-    ----------
-    last : NormalEquations or None
-    """
+    """The last normal equations of a fit, which are its largest arrays."""
 
     def __init__(self, objective: Objective, responses: ResponseCache) -> None:
         self._objective, self._responses = objective, responses
+        # There is only one set, because the next one is as large: it is freed before others are
+        # computed. Its Jacobians are used again at the same state, and its curvature preconditions
+        # accurate steps from states near it.
         self.last: NormalEquations | None = None
         self._preconditions = False
 
@@ -778,6 +656,8 @@ class EquationsCache:
         """Linearise about a state, with derivatives whose error is at most `allowed`."""
         outweighing = 0.0 if final else kappa
         bright = state.bright_companions(outweighing)
+        # Jacobians do not depend on the weights of pixels, so that they stay right at the same
+        # state.
         last, reading = self.last, self._responses.reading(allowed, len(state.points) + bright)
         jacobians: list[Tensor] = []
         error = None
@@ -824,26 +704,8 @@ class Solver:
     """Takes damped Gauss-Newton steps with a given basis.
 
     A step is a function of its arguments: what steers it besides the state is a `StepState`, which
-    the step before has returned. Derivatives come from caches, within the errors that are allowed.
-
-    Parameters
-    ----------
-    problems : sequence of Problem
-        One for each frame.
-    settings : GaussNewton
-    basis : Basis
-    progress : bool
-        Show progress bars.
-
-    Attributes
-    ----------
-    objective : Objective
-    equations : EquationsCache
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For a free parameter that the model does not have, or a star of unknown flux.
+    the step before has returned. Raises `IncompatibleSetupError` for a free parameter that the
+    model does not have, or a star of unknown flux.
     """
 
     def __init__(
@@ -857,6 +719,7 @@ class Solver:
                 "flux is not free and start has no 'flux': how bright is the star? Add 'flux' to "
                 "free, or give start={'flux': light that the pupil collects}"
             )
+        # Bytes of the Jacobians by modes, in single precision, which are always stored.
         jacobians = 4.0 * len(problems) * (len(basis) + settings.prior.amplitude_modes(basis))
         jacobians *= math.prod(problems[0].observation.shape)
         responses = ResponseCache(
@@ -889,26 +752,10 @@ class Solver:
         return torch.cat([unknowns.prior_deviation(), priors.deviation])
 
     def step(self, state: State, carried: StepState, kappa: float, modes: int) -> Step:
-        """Take one damped step.
+        """Take one damped step with the first `modes` modes; 0 for the alignment only.
 
-        Parameters
-        ----------
-        state : State
-        carried : StepState
-            Of the step before.
-        kappa : float
-            Assumed error of the star model, as a fraction of the star.
-        modes : int
-            Number of leading wavefront modes that are free; 0 for alignment only.
-
-        Returns
-        -------
-        state : State
-            Unchanged if no step lowers the penalised chi-squared.
-        gain : float
-            Decrease, or expected decrease, of the penalised chi-squared per pixel.
-        carried : StepState
-            For the next step.
+        The state is unchanged if no step lowers the penalised chi-squared. The gain is the
+        decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
         needs_accurate = carried.needs_accurate and kappa <= carried.kappa and kappa < _FAR
         carried = replace(carried, kappa=kappa, needs_accurate=needs_accurate)
@@ -1028,21 +875,10 @@ class Solver:
         *,
         final: bool = True,
     ) -> LinearModel:
-        """Return the linear model about a state.
+        """Return the linear model about a state, with its first `modes` modes.
 
-        Parameters
-        ----------
-        state : State
-        priors : ModePriors
-        kappa : float
-            Assumed error of the star model, as a fraction of the star.
-        modes : int
-            Number of leading wavefront modes that are unknowns.
-        robust : float
-            Residual, in standard deviations, of half weight; inf for the full weights of all
-            pixels.
-        final : bool
-            Whether errors will be computed from it, for which derivatives must be accurate.
+        `final` says whether errors will be computed from it, for which derivatives must be
+        accurate.
         """
         unknowns, equations = state.unknowns, self.equations.last
         count = unknowns.with_modes(modes)
@@ -1123,12 +959,11 @@ class Solver:
         return update.in_units(unit)
 
     def _cost(self, state: State, noise: Noise, priors: ModePriors) -> float:
-        """Penalised chi-squared.
-
-        With weights that were made robust about the state before a step, a step that lowers it also
-        lowers Cauchy's loss.
-        """
+        """Penalised chi-squared of a state with given noise."""
         deviation = self.prior_deviation(state.unknowns, priors)
+        # Cauchy's loss is concave in the squared residual, so that its tangent lies above it: with
+        # weights that were made robust about the state before a step, a step that lowers this sum
+        # also lowers the loss.
         offset = (state.vector - state.unknowns.initial()) / deviation
         return self.objective.chi2(state, noise) + float((offset**2).sum())
 

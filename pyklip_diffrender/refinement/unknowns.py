@@ -41,60 +41,33 @@ COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 
 
 def brightest(sources: Tensor, kappa: float = 0.0) -> Tensor:
-    """The brightest of companions, if its light depends noticeably on the wavefront.
+    """The brightest of companions (k, 3), if its light depends noticeably on the wavefront.
 
-    One, because its derivatives take as long as those of the star.
-
-    Parameters
-    ----------
-    sources : Tensor, (companions, 3)
-        Contrast, x and y.
-    kappa : float
-        Assumed error of the star model, as a fraction of the star.
-
-    Returns
-    -------
-    Tensor, (0, 3) or (1, 3)
+    The result is (1, 3), or (0, 3) if none does or a model error `kappa` outweighs it.
     """
+    # One, because its derivatives take as long as those of the star.
     first = sources[sources[:, 0].argsort(descending=True)[:1]]
     return first[first[:, 0] > max(_BRIGHT, _OUTWEIGHED * kappa)]
 
 
 @dataclass(frozen=True)
 class FrameUnknowns:
-    """The unknowns of one frame.
+    """The unknowns of one frame, in the units of the parameter table.
 
-    Units are those of the parameter table; a companion is (contrast, x, y) with x, y in arcsec
-    from the star, image orientation; modes are in nm.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Free optical parameters and levels: flux, background and pedestal.
-    start : mapping of str to Tensor
-        Values of all optical parameters that are not at their defaults, free or not, and of
-        the levels.
-    modes : int
-        Wavefront modes.
-    amplitude_modes : int
-        Amplitude modes of the pupil.
-    companions : tuple of Planet
-        Starting values of companions.
-    roll : float
-        Degrees by which the sky is turned, counter-clockwise, relative to the first frame.
-    shows_companions : bool
-        False for a reference star.
-    deviations : mapping of str to float
-        Prior standard deviations that replace those of the parameter table.
+    A companion is (contrast, x, y) with x, y in arcsec from the star, image orientation; modes are
+    in nm.
     """
 
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # Free optical parameters and levels: flux, background and pedestal.
+    # Values of all optical parameters that are not at their defaults, free or not, and of levels.
     start: Mapping[str, Tensor]
     modes: int
     amplitude_modes: int = 0
-    companions: tuple[Planet, ...] = ()
+    companions: tuple[Planet, ...] = ()  # Starting values.
+    # Degrees by which the sky is turned, counter-clockwise, relative to the first frame.
     roll: float = 0.0
-    shows_companions: bool = True
+    shows_companions: bool = True  # False for a reference star.
+    # Prior standard deviations that replace those of the parameter table.
     deviations: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -185,23 +158,13 @@ class FrameUnknowns:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The unknowns of all frames.
+    """The unknowns of all frames."""
 
-    Attributes
-    ----------
-    frames : tuple of FrameUnknowns
-        They differ in their starting values, roll and companions' visibility only.
-    own : tuple of str
-        Names of the parameters that differ between frames.
-    drift : int
-        Number of leading modes that may differ between frames.
-    blocks : tuple of tuple of int
-        For every frame, which blocks of drift its wavefront has; empty without drift.
-    """
-
+    # They differ in their starting values, roll and companions' visibility only.
     frames: tuple[FrameUnknowns, ...]
-    own: tuple[str, ...] = ()
-    drift: int = 0
+    own: tuple[str, ...] = ()  # Names of the parameters that differ between frames.
+    drift: int = 0  # Number of leading modes that may differ between frames.
+    # For every frame, which blocks of drift its wavefront has; empty without drift.
     blocks: tuple[tuple[int, ...], ...] = ()
 
     @cached_property
@@ -238,6 +201,9 @@ class Unknowns:
         return tuple(self._rows(k) for k in range(len(self.frames)))
 
     def _rows(self, frame: int) -> FrameRows:
+        # The vector begins with the own unknowns of every frame, in the order of its vector, and
+        # goes on with the shared ones in the same order. The blocks of drift follow the last of
+        # these, the modes.
         own, shared = frame * self._own_size, len(self.frames) * self._own_size
         rows = torch.empty(self.frames[frame].where("modes").stop, dtype=torch.int64)
         for name, where in self.frames[frame].slices.items():
@@ -275,12 +241,8 @@ class Unknowns:
     def warm(self, values: Mapping[Unknown, float]) -> Tensor:
         """Return the starting vector with the final values of an earlier fit.
 
-        Parameters
-        ----------
-        values : mapping of Unknown to float
-            Those that are not unknowns here are ignored, and missing ones keep their starting
-            values. The bases may differ in length if they begin with the same modes. Companions
-            keep their starting values.
+        Unknowns that are not known here are ignored, and missing ones keep their starting values,
+        as do companions. The bases may differ in length if they begin with the same modes.
         """
         vector = self.initial()
         for place, unknown in enumerate(self.labels()):
@@ -294,12 +256,11 @@ class Unknowns:
         return joined[: self.where("amplitude").start]
 
     def stepped(self, vector: Tensor, step: Tensor) -> Tensor:
-        """The vector after a step of the leading unknowns, within the bounds of all parameters.
-
-        The image is linear in the light of companions, the product of flux and contrast, and not in
-        both factors. The step is therefore that of the light, and the contrast follows from it.
-        """
+        """The vector after a step of the leading unknowns, within the bounds of all parameters."""
         moved = vector.clone()
+        # The image is linear in the light of companions, the product of flux and contrast, and not
+        # in both factors. The step is therefore that of the light, F' c' = F c + c (F' - F) + F dc,
+        # and the contrast after it is c' = c + dc F / F'.
         moved[: len(step)] += step
         before, after = self._flux_with_companions(vector), self._flux_with_companions(moved)
         if before > 0 and after > 0:
