@@ -48,27 +48,13 @@ SHORT = ("use", "star", "date", "position_angle", "integrations", "file")
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A file in the table of a sequence.
-
-    Attributes
-    ----------
-    use : "target", "reference" or "excluded"
-    star : str
-    exposure : Exposure
-        Facts from the header.
-    observation : Observation or None
-        The frames, unless they are excluded.
-    remark : str
-        Why the file is excluded, or what of it was left out.
-    path : Path or None
-        Of the file, where there is one.
-    """
+    """A file in the table of a sequence."""
 
     use: Literal["target", "reference", "excluded"]
     star: str
     exposure: Exposure
-    observation: Observation | None = None
-    remark: str = ""
+    observation: Observation | None = None  # the frames, unless they are excluded
+    remark: str = ""  # why the file is excluded, or what of it was left out
     path: Path | None = None
 
     @property

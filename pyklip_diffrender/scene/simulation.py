@@ -62,19 +62,14 @@ def faintness(observation: Observation) -> float:
     ring = frame.valid[0] & (away > _RING[0]) & (away < _RING[1])
     if not ring.any():
         return 1.0
+    # The chi-squared of an error of the model that is a fraction of the light is proportional to
+    # (S/N)^2.
     squares = (frame.data[0][ring] / frame.error[0][ring]) ** 2
     return _REFERENCE / max(float(np.median(squares)), 1e-6)
 
 
 def coarse_arguments(observation: Observation, size: int) -> dict[str, Any]:
-    """Arguments of `model_for` for a first look, by the noise of the frames.
-
-    Parameters
-    ----------
-    observation : Observation
-    size : int
-        Side of the pixels on which the model is evaluated.
-    """
+    """Arguments of `model_for`, by the noise, for a first look at `size` x `size` pixels."""
     nlambda = 3 if faintness(observation) >= _VERY_FAINT else 5
     if observation.filter is None:
         return {}
