@@ -50,35 +50,10 @@ Array = NDArray[Any]
 
 
 class Conversion:
-    """The planes of a poppy system as planes of this package.
+    """The planes of a poppy system, which passes `check_supported`, as planes of this package.
 
-    Parameters
-    ----------
-    osys : poppy.OpticalSystem
-        A system that passes `poppy.check_supported`.
-    recipe : dict
-        Arguments of `from_poppy`.
-    kinds : mapping of str to type, optional
-        Names of pupil planes that become a subclass of `PupilOptic`. The first stop behind a mask
-        becomes a `MovableStop`, unless it is trainable.
-
-    Attributes
-    ----------
-    entrance, planes, detector, bandpass
-        The arguments of an `OpticalSystem`.
-    propagation : dict of str to str
-        For every image plane, "compact" or "fft".
-    frames : list of Orientation
-        For every plane of poppy's, from its frame to the frame of the system's pupils.
-    sampling : float
-        Samples per lambda/D in image planes.
-    fixed : set of str
-        Settings that cannot be changed without changing what the system computes.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For settings that do not fit the system.
+    `recipe` has the arguments of `from_poppy`, `kinds` names of pupil planes that become a subclass
+    of `PupilOptic`. IncompatibleSetupError for settings that do not fit the system.
     """
 
     def __init__(
@@ -107,12 +82,16 @@ class Conversion:
             )
         self.block = self.sampled // self.npix
         self.diameter = float(first.diam.to_value(u.m))
+        # Samples per lambda/D in image planes.
         sampling = float(recipe["occulter_sampling"] or osys.oversample)
         # A whole number of samples across the image of the pupil array, rounding aside.
         self.sampling = math.ceil(self.npix * sampling - 1e-9) / self.npix
+        # For every image plane, "compact" or "fft".
         self.propagation: dict[str, str] = {}
+        # Settings that cannot be changed without changing what the system computes.
         self.fixed: set[str] = {"npix", "device"} if recipe["trainable"] else set()
         self._has_stop = False
+        # For every plane of poppy's, from its frame to the frame of the system's pupils.
         turns = turns_behind(osys.planes)
         self.frames = [self._to_system(turn) for turn in turns]
         self.planes = self._convert_planes(turns)
@@ -241,6 +220,7 @@ class Conversion:
         uniform = latest.size == 1 or np.ptp(latest) == 0
         if uniform and not trainable and len({id(p) for p in phasors.values()}) == 1:
             return Gain(optic.name, complex(latest.flat[0])), centred
+        # The first stop behind a mask becomes a `MovableStop`, unless it is trainable.
         kind = self.kinds.get(optic.name, PupilOptic)
         behind_mask = any(p.planetype == PlaneType.image for p in self.osys.planes[:index])
         if kind is PupilOptic and behind_mask and not (self._has_stop or trainable):

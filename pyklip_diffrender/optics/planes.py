@@ -197,8 +197,8 @@ class MatrixFourier:
     """The Fourier transform between one pupil window and one set of image positions.
 
     `x` (columns,) and `y` (rows,) are image positions in radians, float64, and may require
-    gradients; `wavelength` is in m. With `shear`, the true y of pixel (i, j) is ``y[i] + shear
-    x[j]``.
+    gradients; `wavelength` is in m. With `shear`, the true y of pixel (i, j) is
+    ``y[i] + shear x[j]``.
     """
 
     def __init__(

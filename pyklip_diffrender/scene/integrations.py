@@ -465,10 +465,10 @@ def calibrated_errors(
     """
     # Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star and
     # where the frame is dark. The robust scatter of these differences over what the errors predict
-    # is the factor f by which the errors there are wrong. With b the median of these errors, (f^2 -
-    # 1) b^2 is added to the variance of every pixel, which leaves the photon noise of the star as
-    # it is. Noise that neighbouring pixels share, such as 1/f noise, cancels in the differences and
-    # is not counted.
+    # is the factor f by which the errors there are wrong. With b the median of these errors,
+    # (f^2 - 1) b^2 is added to the variance of every pixel, which leaves the photon noise of the
+    # star as it is. Noise that neighbouring pixels share, such as 1/f noise, cancels in the
+    # differences and is not counted.
     corrected, ratios = error.copy() if out is None else out, []
     for k, (ratio, floor) in enumerate(_measured(data, error, valid, center, pixelscale)):
         ratios.append(ratio)

@@ -214,8 +214,8 @@ def undo_shifts(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Shift frames (frames, ny, nx) with gaps by less than a pixel, without spreading the gaps.
 
-    Gaps are not finite; errors of 0 or less are gaps, too. `shifts` are x, y in pixels, (frames,
-    2). Frames, errors, and valid pixels, which are not gaps and do not depend on them.
+    Gaps are not finite; errors of 0 or less are gaps, too. `shifts` are x, y in pixels,
+    (frames, 2). Frames, errors, and valid pixels, which are not gaps and do not depend on them.
     """
     # A Fourier shift makes every pixel depend on all pixels of its row and column. Gaps are filled
     # from their neighbours before it; how wrong that may be is added to the variance of the pixels

@@ -57,8 +57,8 @@ class Window:
     @classmethod
     def about(cls, center: NDArray[np.float64], shape: tuple[int, int]) -> Window:
         """Return the box whose middle is within half a pixel of `center`, [x, y]."""
-        # Pixel centres are whole numbers, so that the box from `first` has its middle at first + (n
-        # - 1) / 2.
+        # Pixel centres are whole numbers, so that the box from `first` has its middle at first +
+        # (n - 1) / 2.
         ny, nx = shape
         return cls(round(center[1] - (ny - 1) / 2), round(center[0] - (nx - 1) / 2), shape)
 
