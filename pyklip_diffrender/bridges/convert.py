@@ -370,6 +370,8 @@ def _turned_factor(
     axis: int,
 ) -> Callable[[Tensor], Tensor] | None:
     """The factor of a separable part along one axis of the final image."""
+    # Turns are by right angles, so that an axis of the image is one of the plane's, up to its sign:
+    # one element of the matrix's column is not 0.
     column = (to_plane.matrix[0][axis], to_plane.matrix[1][axis])
     factor, sign = (along_x, column[0]) if column[0] else (along_y, column[1])
     return None if factor is None else lambda positions: factor(sign * positions)

@@ -49,8 +49,8 @@ def intermediate_wavefronts(
     """Fields as poppy's own objects, one per plane, weighted and summed as poppy does.
 
     For an image plane, the field behind the mask on the sampled part of the image. `orientations`
-    are those of the planes relative to poppy's, the entrance pupil first; `normalize` is only
-    "first"; with `only_last` the field on the detector alone.
+    are those of the planes relative to poppy's, the entrance pupil first; `normalize` must be
+    "first". With `only_last` there is the field on the detector alone.
     """
     if normalize.lower() != "first":
         raise IncompatibleSetupError(
@@ -246,12 +246,12 @@ class PoppySystem(OpticalSystem):
     ) -> Any:
         """PSF as an HDUList, with the arguments and the keywords of poppy's `calc_psf`.
 
-        Default are the wavelengths that the system was made for, and equal weights; `source` may
-        have both. `opd` and options are as in a call of the system; options of poppy's that have no
-        meaning here are dropped, nothing is drawn, and saving is refused with a pointer to
-        `return_intermediates`. With that or `return_final`, also a list of `poppy.Wavefront`, one
-        for every pupil plane and the detector, or the one on the detector, summed over wavelengths
-        as poppy does.
+        Wavelengths are by default those that the system was made for, and weights are equal;
+        `source` may have both. `opd` and options are as in a call of the system; options of poppy's
+        that have no meaning here are dropped, nothing is drawn, and saving is refused with a
+        pointer to `return_intermediates`. With that or `return_final`, the second value is a list
+        of `poppy.Wavefront`, one for every pupil plane and the detector, or the one on the
+        detector, summed over wavelengths as poppy does.
         """
         refuse_saving(save_intermediates)
         if source is not None:

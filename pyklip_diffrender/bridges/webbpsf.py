@@ -324,8 +324,8 @@ class WebbSystem(PoppySystem):
         Arguments that are not given keep the values that the system was made with; `opd` and
         parameters are as in a call of the system, for the PSF of a refined wavefront. The image is
         this system's; stpsf itself then adds jitter, distortion, detector effects and header.
-        OVERSAMP, DET_SAMP, and with `add_distortion` OVERDIST and DET_DIST. Nothing is drawn, and
-        saving intermediates is refused.
+        Extensions are OVERSAMP, DET_SAMP, and with `add_distortion` OVERDIST and DET_DIST. Nothing
+        is drawn, and saving intermediates is refused.
         """
         refuse_saving(save_intermediates)
         arguments = {

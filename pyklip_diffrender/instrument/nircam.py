@@ -97,8 +97,8 @@ def internal_wavefront_error(
 ) -> Tensor:
     """NIRCam's internal wavefront error at a mask: Noll coefficients in m, (36,), float64.
 
-    In entrance-pupil orientation, of the map flipped vertically; with `flip` False of the map in
-    the tabulated orientation, that of the exit pupil, as stpsf took it before 2.2.0.
+    They are in entrance-pupil orientation, of the map flipped vertically; with `flip` False of the
+    map in the tabulated orientation, that of the exit pupil, as stpsf took it before 2.2.0.
     """
     # STScI's table has the same values for B as for A, at places mirrored in V2. There the two bars
     # change places.

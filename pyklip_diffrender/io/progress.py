@@ -92,6 +92,8 @@ class _Schedule:
         if self._part > 0:
             # By the speed of what is done of this stage, which is a large one.
             pace = self._part_spent / (self._own * self._part) if self._own else pace
+            # What was expected of the rest, at that pace, less what has passed since the part was
+            # noted.
             rest = (self._own * (1 - self._part) + later) * pace - (spent - self._part_spent)
             return f", about {duration(max(rest, later * pace))} left"
         if spent <= self._own * pace:
@@ -182,8 +184,9 @@ def stage(name: str) -> Iterator[None]:
 class ProgressBar:
     """A progress bar that also writes a line to the log now and then, at most one a minute.
 
-    Inside a `stage` the name of the stage is shown in place of `name`. `total` is None for a loop
-    that ends when it has converged. A bar inside another one is not shown, nor logged.
+    Inside a `stage` the name of the stage is shown in place of `name`. It is on standard error if
+    `shown`. `total` is None for a loop that ends when it has converged. A bar inside another one is
+    not shown, nor logged.
     """
 
     def __init__(self, name: str, total: int | None = None, *, shown: bool) -> None:

@@ -18,7 +18,7 @@ so that the adjoint of E0 -> Ed is
 g -> (1 - F^-1 (1 - t) F) L exp(-2 pi i W / lambda) F^-1 g.
 
 With S = L exp(2 pi i W / lambda), the last four lines are one, Ed = F[S E0] - F[S] * (1 - t) F[E0],
-where * is a convolution of small arrays: `optics.fast` computes that.
+where * is a convolution of small arrays: `optics.fast_path` computes that.
 
 A plane maps one `Wavefront` to the next. Values of free parameters are passed by name; a plane uses
 those that it declares in `parameters`.

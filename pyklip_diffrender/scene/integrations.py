@@ -250,7 +250,10 @@ def compressed(stack: NDArray[Any], kept: NDArray[np.bool_]) -> NDArray[Any]:
 
 
 def empty_integrations(data: Stack, valid: Iterable[Mask]) -> Judgement:
-    """Find frames (ny, nx) whose usable pixels, `valid`, are none, or all have one value."""
+    """Find integrations without `valid` pixels, or whose pixels all have one value.
+
+    `data` is (frames, ny, nx), each of `valid` (ny, nx).
+    """
     kept = np.ones(len(data), dtype=bool)
     remarks = []
     for k, (frame, usable) in enumerate(zip(data, valid, strict=True)):
@@ -402,6 +405,8 @@ def pointings(center: Stack, angles: NDArray[np.float64] | None) -> Iterator[NDA
     `center` is x, y of the star in pixels, (frames, 2); `angles` are in degrees, (frames,), or
     None.
     """
+    # Groups are formed about the first frame that is left, so that none is wider than twice the
+    # limits.
     left = np.ones(len(center), dtype=bool)
     turns = np.zeros(len(center)) if angles is None else angles
     while left.any():
@@ -459,9 +464,9 @@ def calibrated_errors(
     """Correct the part of the errors, (frames, ny, nx), that does not depend on the light.
 
     `center` is x, y of the star, (frames, 2), 0-indexed, `pixelscale` x, y in arcsec per pixel. The
-    new errors are written to `out`, which may be `error`. Also the factor of every frame by which
-    its errors were wrong; frames with fewer than 2000 usable pixels far from the star keep their
-    errors and have NaN.
+    new errors are written to `out`, which may be `error`. The second value has for every frame the
+    factor by which its errors were wrong. Frames with fewer than 2000 usable pixels far from the
+    star keep their errors, and their factor is NaN.
     """
     # Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star and
     # where the frame is dark. The robust scatter of these differences over what the errors predict

@@ -215,7 +215,8 @@ def undo_shifts(
     """Shift frames (frames, ny, nx) with gaps by less than a pixel, without spreading the gaps.
 
     Gaps are not finite; errors of 0 or less are gaps, too. `shifts` are x, y in pixels,
-    (frames, 2). Frames, errors, and valid pixels, which are not gaps and do not depend on them.
+    (frames, 2). The result has the frames, their errors, and the valid pixels, which are no gaps
+    and do not depend on any.
     """
     # A Fourier shift makes every pixel depend on all pixels of its row and column. Gaps are filled
     # from their neighbours before it; how wrong that may be is added to the variance of the pixels
@@ -361,7 +362,8 @@ def read_calints(
     """Read an open calints file: arguments of `Observation.from_arrays`, and `recorded_shifts`.
 
     The images of `hdus`, from `open_fits`, need not be read. `star` is its x, y in pixels from 0,
-    in place of what the header says.
+    in place of what the header says. `compact` keeps pixels and errors in single precision if the
+    file has them so.
     """
     name = Path(path).name
     if "SCI" not in hdus:

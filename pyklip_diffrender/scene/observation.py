@@ -466,6 +466,7 @@ class Observation:
             for key in ("data", "error", "valid", "center", "position_angles")
             if getattr(self, key) is not None
         }
+        # The mean of the integrations: each observation counts by the number that it has.
         offsets = [each.star_offset for each in every if each.star_offset is not None]
         if len(offsets) == len(every):
             x, y = np.average(offsets, axis=0, weights=[each.count for each in every])

@@ -269,7 +269,8 @@ def brightness(observation: Observation) -> float:
 def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
     """Find frames of a star, in one set-up, that are much brighter or fainter than the others.
 
-    Reasons by index. Where half of the frames or more have one, nothing says which are right.
+    The result has reasons by index. Where half of the frames or more have one, nothing says which
+    are right.
     """
     light = np.array([brightness(each) for each in observations])
     known = np.flatnonzero(np.isfinite(light) & (light > 0))
@@ -292,9 +293,9 @@ def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
 def why_turned(observations: Sequence[Observation]) -> dict[int, str]:
     """Find frames of one set-up whose pixels are mirrored or turned, unlike those of most others.
 
-    Reasons by index. Where half of the frames or more have one, nothing says which are right.
-    Frames that are too small, or that show another source as bright as the star behind the mask,
-    which turns with the sky, are not compared.
+    The result has reasons by index. Where half of the frames or more have one, nothing says which
+    are right. Frames that are too small, or that show another source as bright as the star behind
+    the mask, which turns with the sky, are not compared.
     """
     # The telescope, and with it the star's diffraction pattern, has one orientation on the
     # detector.

@@ -310,6 +310,9 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
+        # Stars are told apart on copies of the files, because the reasons that this fills in hold
+        # for one filter alone. Where there are several filters, frames are judged first, so that
+        # none is there only by frames that are excluded.
         listed = _usable(files, references, star, target)
         if filter is not None:
             return cls._by_epoch(listed, target, filter)
@@ -429,6 +432,7 @@ class Sequence:
         for k, place in enumerate(places):
             if first is None or place is None:
                 continue
+            # How far the first pixel of the first window on the detector is from that of this one.
             x, y = first - place
             if max(abs(x), abs(y)) <= _NEARLY_THE_SAME:
                 windows[k] = Window(windows[k].y + int(y), windows[k].x + int(x), shape)

@@ -164,6 +164,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             )
         shortest = float(filter_throughput(observation.filter)[0][0])
         (ny, nx), (x, y) = observation.shape, place.siaf_pixelscale
+        # Powers of two times the default, until the image of the sampled pupil does not repeat in
+        # the field.
         npix = _NPIX
         while npix < samples_for_field(max(nx * x, ny * y, place.period()), shortest):
             npix *= 2
@@ -257,6 +259,7 @@ def simulate(
     generator = np.random.default_rng(seed)
     counts = generator.poisson(expected, size=(frames, *expected.shape)).astype(np.float64)
     counts += generator.normal(0.0, scene.read_noise, size=counts.shape)
+    # As an observer would: the variance of the counts is estimated by the counts themselves.
     error = np.sqrt(np.maximum(counts, 0.0) + scene.read_noise**2)
     return Observation.from_arrays(
         counts,

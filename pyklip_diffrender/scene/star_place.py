@@ -59,8 +59,9 @@ def stamp_about(
 ) -> tuple[Image, Image, Image] | None:
     """Cut the square (n, n) about a star out of an image (ny, nx), without the background.
 
-    `center` is x, y of the star, (2,), `pixelscale` in arcsec. The image, distances from its middle
-    in arcsec, and noise; n is odd. None for images that reach less than 1.2 arcsec from the star.
+    `center` is x, y of the star, (2,), `pixelscale` in arcsec. The result has the image, the
+    distances from its middle in arcsec, and the noise; n is odd. None for images that reach less
+    than 1.2 arcsec from the star.
     """
     x, y = np.round(center).astype(int)
     ny, nx = data.shape
@@ -87,8 +88,8 @@ def stamp_about(
 def center_of_symmetry(image: Image) -> Image:
     """x, y from the middle, (2,), in pixels, of the point about which an image is most symmetric.
 
-    The image is (n, n) with n odd; negative pixels count as 0. A tenth of a pixel for stars on real
-    frames.
+    The image is (n, n) with n odd; negative pixels count as 0. It is good to a tenth of a pixel for
+    stars on real frames.
     """
     # The convolution of the image with itself at 2 c, sum over x of f(x) f(2 c - x), compares it
     # with itself turned by 180 degrees about c; it is largest where these are most alike.
@@ -154,8 +155,8 @@ def local_maxima(
 ) -> list[tuple[int, int]]:
     """Row and column of the `allowed` pixels above a threshold that are the maximum of a square.
 
-    `image` is (ny, nx), NaN where unknown; the square about a pixel has the side `size`. Highest
-    first.
+    `image` is (ny, nx), NaN where unknown; the square about a pixel has the side `size`. The
+    highest maximum is first.
     """
     filled = np.where(np.isnan(image), -math.inf, image)
     peaks = (filled == maximum_filter(filled, size=size)) & allowed & (filled > threshold)

@@ -137,6 +137,7 @@ class FourierModes:
         # is sensitive to frequencies up to about 24.
         self.max_cycles, self.min_cycles = float(max_cycles), float(min_cycles)
         reach = math.floor(max_cycles)
+        # One of each two opposite frequencies, whose cosine and sine are the same but for a sign.
         pairs = [
             (fx, fy)
             for fy in range(reach + 1)
