@@ -172,7 +172,10 @@ class Conversion:
             if not opds:
                 amplitude = np.broadcast_to(np.abs(phasor), shape)
             opds[wavelength] = self._averaged(np.broadcast_to(opd, shape))
+        # The OPD at the first wavelength is that of calls without one; what it differs by at the
+        # others is added in every call.
         base = opds[self.bandpass.wavelengths[0]]
+        # poppy counts the angle of a source from +y, counter-clockwise.
         r, theta = float(self.osys.source_offset_r), np.deg2rad(self.osys.source_offset_theta)
         return OrientedPupil(
             torch.from_numpy(native_float64(self._averaged(amplitude))),

@@ -254,6 +254,7 @@ class SampledOcculter(Plane):
         if not isinstance(part, BoxPart):
             return None
         left, right, bottom, top = part.box
+        # `CompactOcculter` has a real transmission.
         x = torch.linspace(left, right, 65, dtype=torch.float64)
         y = torch.linspace(bottom, top, 65, dtype=torch.float64)
         if bool((part.complement(x[None, :], y[:, None], wavelength).imag != 0).any()):

@@ -165,6 +165,8 @@ class SplineRotation:
         half = [(n - 1) / 2 for n in shape]
         y = (torch.arange(shape[0], dtype=torch.float64) - half[0])[:, None]
         x = (torch.arange(shape[1], dtype=torch.float64) - half[1])[None, :]
+        # Where the sample at (y, x) of the result is in the array: the rotation back, about the
+        # middle.
         from_row = cosine * y + sine * x + half[0]
         from_column = -sine * y + cosine * x + half[1]
         self._rows = self._taps(from_row, shape[0])

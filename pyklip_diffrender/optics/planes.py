@@ -568,6 +568,8 @@ class Detector:
                 self.shear,
             )
 
+        # The transform to a detector that is shifted holds for one shift, which may need a
+        # derivative.
         key = (wavefront.wavelength, wavefront.grid)
         moved = "detector_shift" in values
         transform = make() if moved else self._transforms.kept(key, make)

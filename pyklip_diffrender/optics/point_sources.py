@@ -153,6 +153,9 @@ class PointSources:
         ones = torch.ones((), dtype=model.dtype.to_complex(), device=model.device)
         stop = Wavefront(ones.expand(front.grid.shape), wavelength, front.grid)
         occulter = None
+        # Up to the occulter, planes act on the field of the source; those behind it are multiplied
+        # to one, because the kernel is the transform of their product. Without an occulter all act
+        # on the field.
         for plane, onto in zip(planes, windows, strict=True):
             if isinstance(plane, CompactOcculter):
                 occulter = plane

@@ -513,6 +513,8 @@ def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[Fram
         lengths[each.exposure.setup] += each.exposure.integrations or 0
 
     def preference(setup: tuple[str | None, ...]) -> tuple[float, ...]:
+        # Of set-ups with as many frames of the target: the one with more cards, then with more
+        # frames of all stars, then with more integrations.
         known = sum(part is not None for part in setup)
         return counts[setup], known, everywhere[setup], lengths[setup]
 

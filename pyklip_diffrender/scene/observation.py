@@ -658,6 +658,7 @@ class Observation:
             pairs = zip(windows, stack, strict=True)
             return np.concatenate([window.cut(frame[None], fill) for window, frame in pairs])
 
+        # Frames that are cut at different pixels have no first pixel on the detector in common.
         corners = np.array([(window.x, window.y) for window in windows])
         origin = None
         if self.first_pixel is not None and (corners == corners[0]).all():

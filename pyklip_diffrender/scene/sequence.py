@@ -384,6 +384,7 @@ class Sequence:
             for part in () if observation is None else observation.pointings():
                 part = replace(part, reference=use == "reference")
                 used[use].append(part)
+                # Segments are files of one exposure, which has no number of a segment in its name.
                 exposures[part.name] = re.sub(r"-seg\d+", "", each.exposure.identity or part.name)
                 remark = "; ".join(part.remarks)
                 rows.append(Row(use, each.star, each.exposure, part, remark, each.path))

@@ -147,6 +147,7 @@ def measured_offset(
     about = np.hypot(columns - away[0], rows - away[1]) * pixelscale
     if np.hypot(*(center_of_pattern(bright, about) - away)) * pixelscale > _AGREE:
         return None
+    # `stamp_about` has the nearest whole pixel in its middle.
     return np.asarray(np.round(center) + away - center)
 
 
