@@ -50,35 +50,10 @@ Array = NDArray[Any]
 
 
 class Conversion:
-    """The planes of a poppy system as planes of this package.
+    """The planes of a poppy system, which passes `check_supported`, as planes of this package.
 
-    Parameters
-    ----------
-    osys : poppy.OpticalSystem
-        A system that passes `poppy.check_supported`.
-    recipe : dict
-        Arguments of `from_poppy`.
-    kinds : mapping of str to type, optional
-        Names of pupil planes that become a subclass of `PupilOptic`. The first stop behind a mask
-        becomes a `MovableStop`, unless it is trainable.
-
-    Attributes
-    ----------
-    entrance, planes, detector, bandpass
-        The arguments of an `OpticalSystem`.
-    propagation : dict of str to str
-        For every image plane, "compact" or "fft".
-    frames : list of Orientation
-        For every plane of poppy's, from its frame to the frame of the system's pupils.
-    sampling : float
-        Samples per lambda/D in image planes.
-    fixed : set of str
-        Settings that cannot be changed without changing what the system computes.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For settings that do not fit the system.
+    `recipe` has the arguments of `from_poppy`, `kinds` names of pupil planes that become a subclass
+    of `PupilOptic`. IncompatibleSetupError for settings that do not fit the system.
     """
 
     def __init__(
@@ -107,12 +82,16 @@ class Conversion:
             )
         self.block = self.sampled // self.npix
         self.diameter = float(first.diam.to_value(u.m))
+        # Samples per lambda/D in image planes.
         sampling = float(recipe["occulter_sampling"] or osys.oversample)
         # A whole number of samples across the image of the pupil array, rounding aside.
         self.sampling = math.ceil(self.npix * sampling - 1e-9) / self.npix
+        # For every image plane, "compact" or "fft".
         self.propagation: dict[str, str] = {}
+        # Settings that cannot be changed without changing what the system computes.
         self.fixed: set[str] = {"npix", "device"} if recipe["trainable"] else set()
         self._has_stop = False
+        # For every plane of poppy's, from its frame to the frame of the system's pupils.
         turns = turns_behind(osys.planes)
         self.frames = [self._to_system(turn) for turn in turns]
         self.planes = self._convert_planes(turns)
@@ -193,7 +172,10 @@ class Conversion:
             if not opds:
                 amplitude = np.broadcast_to(np.abs(phasor), shape)
             opds[wavelength] = self._averaged(np.broadcast_to(opd, shape))
+        # The OPD at the first wavelength is that of calls without one; what it differs by at the
+        # others is added in every call.
         base = opds[self.bandpass.wavelengths[0]]
+        # poppy counts the angle of a source from +y, counter-clockwise.
         r, theta = float(self.osys.source_offset_r), np.deg2rad(self.osys.source_offset_theta)
         return OrientedPupil(
             torch.from_numpy(native_float64(self._averaged(amplitude))),
@@ -241,6 +223,7 @@ class Conversion:
         uniform = latest.size == 1 or np.ptp(latest) == 0
         if uniform and not trainable and len({id(p) for p in phasors.values()}) == 1:
             return Gain(optic.name, complex(latest.flat[0])), centred
+        # The first stop behind a mask becomes a `MovableStop`, unless it is trainable.
         kind = self.kinds.get(optic.name, PupilOptic)
         behind_mask = any(p.planetype == PlaneType.image for p in self.osys.planes[:index])
         if kind is PupilOptic and behind_mask and not (self._has_stop or trainable):
@@ -390,6 +373,8 @@ def _turned_factor(
     axis: int,
 ) -> Callable[[Tensor], Tensor] | None:
     """The factor of a separable part along one axis of the final image."""
+    # Turns are by right angles, so that an axis of the image is one of the plane's, up to its sign:
+    # one element of the matrix's column is not 0.
     column = (to_plane.matrix[0][axis], to_plane.matrix[1][axis])
     factor, sign = (along_x, column[0]) if column[0] else (along_y, column[1])
     return None if factor is None else lambda positions: factor(sign * positions)

@@ -88,12 +88,8 @@ class MaskPart(Protocol):
 class BoxPart:
     """A part that is clear outside a box: two matrix transforms on the lattice inside it.
 
-    Parameters
-    ----------
-    complement : callable
-        (x, y, wavelength) to ``1 - t``: x (1, columns) and y (rows, 1) in arcsec, image
-        orientation, wavelength in m.
-    box : Box
+    `complement` maps x (1, columns) and y (rows, 1), in arcsec, image orientation, and a wavelength
+    in m to ``1 - t``.
     """
 
     def __init__(self, complement: Callable[[Tensor, Tensor, float], Tensor], box: Box) -> None:
@@ -139,13 +135,8 @@ class BoxPart:
 class SeparablePart:
     """A part ``f(x) g(y)`` that may reach to the end of the image: one convolution per axis.
 
-    Parameters
-    ----------
-    along_x, along_y : callable or None
-        From positions in arcsec, image orientation, to the factor of ``1 - t``; None for 1.
-    sampling : float
-        Lattice points per lambda/diameter. As in an FFT of the pupil padded by this factor, the
-        lattice ends at ``npix / 2`` lambda/diameter.
+    `along_x` and `along_y` map positions in arcsec, image orientation, to the factor of ``1 - t``,
+    or are None for 1; `sampling` is in lattice points per lambda/diameter.
     """
 
     def __init__(
@@ -164,6 +155,8 @@ class SeparablePart:
             grid = wavefront.grid
             factor = self.along_x if axis == "x" else self.along_y
             assert factor is not None
+            # As in an FFT of the pupil padded by `sampling`, the lattice ends at npix / 2
+            # lambda/diameter.
             count = round(grid.npix * self.sampling)
             index = torch.arange(count) - count // 2
             values = factor(index * spacing / ARCSEC).to(torch.float64)
@@ -183,6 +176,10 @@ class SeparablePart:
     def _convolved(
         self, field: Tensor, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid
     ) -> Tensor:
+        # For n samples in front and m behind there are n + m - 1 distances, beginning with that
+        # from the last sample in front to the first one behind. An FFT of that length wraps around,
+        # but not in the elements n - 1 to n + m - 2 of the convolution, which are the samples
+        # behind.
         spectrum = self._spectrum(axis, wavefront, spacing, onto)
         dim = -1 if axis == "x" else -2
         first = field.shape[dim] - 1
@@ -206,15 +203,9 @@ class SeparablePart:
 class SampledOcculter(Plane):
     """A mask that is clear except for its parts, which share a lattice.
 
-    Parameters
-    ----------
-    parts : sequence of MaskPart
-        Their complements add up to that of the mask.
-    sampling : float
-        Lattice points per lambda / `diameter`.
-    grid : PupilGrid
-        The window with all the light in front of the mask: the pupil array, or the padded one if a
-        mask scatters light beyond the pupil array and no aperture holds it back.
+    Complements of the parts add up; `sampling` is in lattice points per lambda / `diameter`. `grid`
+    is the window with all the light in front of the mask: the pupil array, or the padded one if a
+    mask scatters light beyond the pupil array and no aperture holds it back.
     """
 
     focal = True
@@ -263,6 +254,7 @@ class SampledOcculter(Plane):
         if not isinstance(part, BoxPart):
             return None
         left, right, bottom, top = part.box
+        # `CompactOcculter` has a real transmission.
         x = torch.linspace(left, right, 65, dtype=torch.float64)
         y = torch.linspace(bottom, top, 65, dtype=torch.float64)
         if bool((part.complement(x[None, :], y[:, None], wavelength).imag != 0).any()):
@@ -287,14 +279,10 @@ class SampledOcculter(Plane):
 class FourierMask(Plane):
     """A mask of any kind by FFTs of the padded pupil, as in poppy.
 
-    Parameters
-    ----------
-    transmission : callable
-        Wavelength (m) to the complex amplitude transmission on the lattice, (n, n) with
-        n = npix times `padding`, the axis at sample n // 2; frame of the pupil transform with
-        positive exponents in x and y.
-    padding : int
-        Lattice points per lambda / diameter.
+    `transmission` maps a wavelength (m) to the complex amplitude transmission on the lattice,
+    (n, n) with n = npix times `padding`, the axis at sample n // 2, in the frame of the pupil
+    transform with positive exponents in x and y. `padding` is in lattice points per lambda /
+    diameter.
     """
 
     focal = True
@@ -351,15 +339,9 @@ COMPACT_OPTICS = (
 
 
 class ImageSamples(poppy.Wavefront):
-    """A wavefront without a field, at given image positions, on which optics are evaluated.
+    """A wavefront without a field, on which optics are evaluated at given image positions.
 
-    Parameters
-    ----------
-    wavelength, diameter : float
-        m.
-    oversample : int
-    x, y : Tensor, (rows, columns)
-        arcsec, equally spaced.
+    `x` and `y`, (rows, columns), are in arcsec, equally spaced; wavelength and diameter are in m.
     """
 
     def __init__(
@@ -385,12 +367,7 @@ class ImageSamples(poppy.Wavefront):
 
 
 class MaskStack:
-    """Several masks in one image plane.
-
-    Parameters
-    ----------
-    optics : list of poppy.OpticalElement
-    """
+    """Several masks, poppy's optics, in one image plane."""
 
     def __init__(self, optics: list[Any]) -> None:
         self.optics = optics
@@ -430,20 +407,11 @@ def pupil_phasor(optic: Any, wave: poppy.Wavefront) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a mask's complement: an optic inside a box, or a product along the axes.
+    """A part of a mask's complement: an optic inside a box, or a product along the axes."""
 
-    Attributes
-    ----------
-    box : Box or None
-        Extent of the part of `optic` that is not clear, arcsec, frame of the plane.
-    optic : object
-        Evaluated inside the box.
-    along_x, along_y : callable or None
-        Factors of ``1 - t`` where there is no box; None is 1 everywhere.
-    """
-
-    box: Box | None = None
+    box: Box | None = None  # where `optic` is not clear, arcsec, frame of the plane
     optic: Any = None
+    # Factors of 1 - t where there is no box; None is 1 everywhere.
     along_x: Callable[[Tensor], Tensor] | None = None
     along_y: Callable[[Tensor], Tensor] | None = None
 
@@ -451,11 +419,7 @@ class Part:
 def complement_box(optic: Any, margin: float) -> list[Part] | None:
     """The parts of an image-plane optic that are not clear, or None if they have no bounds.
 
-    Parameters
-    ----------
-    optic : poppy.OpticalElement
-    margin : float
-        arcsec to add for anti-aliased edges.
+    `margin` (arcsec) is added for anti-aliased edges.
     """
     if isinstance(optic, MaskStack):
         parts = [complement_box(mask, margin) for mask in optic.optics]

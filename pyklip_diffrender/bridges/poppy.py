@@ -48,17 +48,9 @@ def intermediate_wavefronts(
 ) -> list[poppy.Wavefront]:
     """Fields as poppy's own objects, one per plane, weighted and summed as poppy does.
 
-    For an image plane, the field behind the mask on the sampled part of the image.
-
-    Parameters
-    ----------
-    system : OpticalSystem
-    orientations : sequence of Orientation
-        Orientation of every plane relative to poppy's, the entrance pupil first.
-    normalize : str
-        Only "first".
-    only_last : bool
-        Return the field on the detector alone.
+    For an image plane, the field behind the mask on the sampled part of the image. `orientations`
+    are those of the planes relative to poppy's, the entrance pupil first; `normalize` must be
+    "first". With `only_last` there is the field on the detector alone.
     """
     if normalize.lower() != "first":
         raise IncompatibleSetupError(
@@ -148,15 +140,7 @@ _SUPPORTED = (
 
 
 class PoppySystem(OpticalSystem):
-    """An `OpticalSystem` made from poppy's, with its plane names and interface.
-
-    Attributes
-    ----------
-    propagation : dict of str to str
-        For every image plane, "compact" or "fft".
-    frames : list of Orientation
-        For every plane of poppy's, from its frame to the frame of this system's pupils.
-    """
+    """An `OpticalSystem` made from poppy's, with its names and interface; see `Conversion`."""
 
     _sources: ClassVar[tuple[str, ...]] = ("osys", "trainable")
     """Arguments that define the system, as opposed to settings of it."""
@@ -224,13 +208,7 @@ class PoppySystem(OpticalSystem):
         return system
 
     def plane(self, name: str) -> Any:
-        """The plane with this name.
-
-        Raises
-        ------
-        KeyError
-            If there is none.
-        """
+        """The plane with this name; KeyError if there is none."""
         planes: list[Any] = [self.entrance, *self.planes, self.detector]
         for plane in planes:
             if plane.name == name:
@@ -268,28 +246,12 @@ class PoppySystem(OpticalSystem):
     ) -> Any:
         """PSF as an HDUList, with the arguments and the keywords of poppy's `calc_psf`.
 
-        Parameters
-        ----------
-        wavelength : Quantity, float (m) or sequence of them, optional
-            Default: the wavelengths that the system was made for.
-        weight : sequence of float, optional
-            One per wavelength; default equal.
-        source : dict, optional
-            With "wavelengths" and "weights", in place of the two above.
-        normalize : str
-            "first", "last", "exit_pupil" or "none", as in poppy.
-        return_intermediates, return_final : bool
-            Also return a list of `poppy.Wavefront`: one for every pupil plane and the detector,
-            or the one on the detector. They are summed over wavelengths as poppy does.
-        opd, **options
-            As in a call of the system. Options of poppy's that have no meaning here are dropped.
-        save_intermediates, save_intermediates_what, display
-            Accepted for compatibility with poppy. Nothing is drawn, and saving is refused with a
-            pointer to `return_intermediates`.
-
-        Returns
-        -------
-        HDUList, or (HDUList, list of Wavefront)
+        Wavelengths are by default those that the system was made for, and weights are equal;
+        `source` may have both. `opd` and options are as in a call of the system; options of poppy's
+        that have no meaning here are dropped, nothing is drawn, and saving is refused with a
+        pointer to `return_intermediates`. With that or `return_final`, the second value is a list
+        of `poppy.Wavefront`, one for every pupil plane and the detector, or the one on the
+        detector, summed over wavelengths as poppy does.
         """
         refuse_saving(save_intermediates)
         if source is not None:

@@ -55,14 +55,9 @@ Matrix = tuple[tuple[int, int], tuple[int, int]]
 
 @dataclass(frozen=True)
 class Orientation:
-    """A symmetry of the square, one of eight, as the matrix that acts on positions (x, y).
+    """A symmetry of the square, one of eight, as the matrix that acts on positions (x, y)."""
 
-    Attributes
-    ----------
-    matrix : 2 x 2 of int
-        New position from old: ``x' = m[0][0] x + m[0][1] y`` and likewise for ``y'``.
-    """
-
+    # New position from old: x' = m[0][0] x + m[0][1] y, and likewise for y'.
     matrix: Matrix = ((1, 0), (0, 1))
 
     @classmethod
@@ -158,12 +153,8 @@ def free_turn(planes: Sequence[Any]) -> float:
 class SplineRotation:
     """Cubic-spline rotation of arrays: `scipy.ndimage.rotate` as a linear torch function.
 
-    Parameters
-    ----------
-    angle : float
-        Degrees, from the first axis of the array to the second, as scipy counts.
-    shape : tuple of int
-        Rows and columns, of the output as well.
+    `angle` is in degrees, from the first axis of the array to the second, as scipy counts; `shape`
+    is that of the output as well.
     """
 
     def __init__(self, angle: float, shape: tuple[int, int]) -> None:
@@ -174,6 +165,8 @@ class SplineRotation:
         half = [(n - 1) / 2 for n in shape]
         y = (torch.arange(shape[0], dtype=torch.float64) - half[0])[:, None]
         x = (torch.arange(shape[1], dtype=torch.float64) - half[1])[None, :]
+        # Where the sample at (y, x) of the result is in the array: the rotation back, about the
+        # middle.
         from_row = cosine * y + sine * x + half[0]
         from_column = -sine * y + cosine * x + half[1]
         self._rows = self._taps(from_row, shape[0])
@@ -188,6 +181,8 @@ class SplineRotation:
     @staticmethod
     def _taps(position: Tensor, size: int) -> list[tuple[Tensor, Tensor]]:
         """Index and weight of the four spline coefficients around every position."""
+        # Cubic B-splines at the distances 1 + t, t, 1 - t and 2 - t; coefficients beyond an edge
+        # are mirrored about the sample at the edge.
         first = torch.floor(position)
         t = position - first
         weights = (
@@ -219,13 +214,7 @@ class SplineRotation:
 
 
 class FreeRotation(Plane):
-    """A rotation of the field in a pupil by any angle.
-
-    Parameters
-    ----------
-    angle : float
-        Degrees, counter-clockwise (from +x to +y), frame of the system.
-    """
+    """A rotation of the field in a pupil by `angle` degrees, counter-clockwise (system's frame)."""
 
     def __init__(self, angle: float, npix: int, diameter: float, name: str) -> None:
         self.name = name
@@ -248,24 +237,10 @@ class FreeRotation(Plane):
 class OrientedPupil(EntrancePupil):
     """An entrance pupil in any frame, with a wavefront and a pointing of its own.
 
-    Parameters
-    ----------
-    amplitude, opd : Tensor, (npix, npix)
-        Amplitude transmission and OPD (m), frame of the entrance pupil. The OPD is used in calls
-        without one.
-    orientation : Orientation
-        From the frame of the entrance pupil to that of the system.
-    pointing : tuple of float
-        x, y in arcsec on the image, added to every star offset.
-    chromatic : mapping of float to Tensor
-        Wavelength (m) to an OPD (m) that is added to that of every call, frame of the entrance
-        pupil.
-    turned : float
-        Rotation of the image by planes behind, degrees counter-clockwise; sources are rotated the
-        other way, so that they appear at their star offset.
-    collected : float, optional
-        Sum of the squared amplitude of the true pupil, in units of a sample's area. Default that of
-        `amplitude`, which is smaller if samples are means over partly blocked areas.
+    `amplitude` and `opd` (m), for calls without one, are (npix, npix) in the frame of the entrance
+    pupil, which `orientation` takes to that of the system. `pointing`, x, y in arcsec on the image,
+    is added to every star offset, and `chromatic` has for wavelengths (m) an OPD (m, same frame)
+    that is added to that of every call.
     """
 
     sampled = True
@@ -286,6 +261,8 @@ class OrientedPupil(EntrancePupil):
     ) -> None:
         array = orientation.apply(amplitude).contiguous().to(device)
         super().__init__(array, diameter, dtype, name)
+        # The sum of the squared amplitude of the true pupil, in units of a sample's area: samples
+        # that are means over partly blocked areas have less.
         if collected is not None:
             self.amplitude = self.amplitude * math.sqrt(self.total / collected)
             self.total = collected
@@ -295,6 +272,8 @@ class OrientedPupil(EntrancePupil):
         self.orientation = orientation
         self.pointing = torch.tensor(pointing, dtype=torch.float64, device=device)
         self.chromatic = {w: extra.to(device) for w, extra in (chromatic or {}).items()}
+        # Planes behind rotate the image by `turned` degrees counter-clockwise; sources are rotated
+        # the other way, so that they appear at their star offset.
         self._tilt = torch.from_numpy(rotation_matrix(-turned).T.copy()).to(device)
 
     def on_window(self, maps: Tensor) -> Tensor:
@@ -311,20 +290,10 @@ class OrientedPupil(EntrancePupil):
 
 
 class PupilOptic(Plane):
-    """Amplitude and phase in a pupil plane, one array per wavelength.
+    """Amplitude and phase in a pupil plane, one array per wavelength (m).
 
-    Parameters
-    ----------
-    phasors : mapping of float to Tensor
-        Wavelength (m) to complex amplitude transmission, (npix, npix), frame of this plane. A
-        larger array reaches beyond the pupil by as much on every side.
-    npix : int
-        Samples across the pupil.
-    orientation : Orientation
-        From the frame of this plane to that of the system.
-    trainable : bool
-        Make the leaf tensors `opd` (m, added) and `transmission` (a factor), both (npix, npix) in
-        the frame of this plane, to optimise by their gradients.
+    Complex amplitude transmissions are (npix, npix) in the frame of this plane, which `orientation`
+    takes to that of the system; a larger array reaches beyond the pupil by as much on every side.
     """
 
     sampled = True
@@ -355,6 +324,8 @@ class PupilOptic(Plane):
             wavelength: turned_phasors[id(phasor)] for wavelength, phasor in phasors.items()
         }
         self._full, self._dtype = full, dtype
+        # With `trainable`, leaf tensors to optimise by their gradients, in the frame of this plane:
+        # `opd` (m) is added, `transmission` is a factor.
         self.opd: Tensor | None = None
         self.transmission: Tensor | None = None
         if trainable:
@@ -385,12 +356,7 @@ class PupilOptic(Plane):
 
 
 class MovableStop(PupilOptic):
-    """A stop known from its samples only, that can be shifted and turned.
-
-    At rest the samples are used directly. Elsewhere they are interpolated by cubic convolution
-    (R. Keys, IEEE Trans. Acoust. Speech Signal Process. 29, 1153, 1981), which is exact for shifts
-    by whole samples. Parameters as for `planes.LyotStop`.
-    """
+    """A stop known from its samples only, that can be shifted and turned as a `planes.LyotStop`."""
 
     parameters = ("lyot_shift", "lyot_rotation")
     margin = 0.06
@@ -411,6 +377,8 @@ class MovableStop(PupilOptic):
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Multiply by the stop at its position."""
+        # At rest the samples are used directly. Elsewhere they are interpolated by cubic
+        # convolution, which is exact for shifts by whole samples.
         if not self._moves(values):
             return super().apply(wavefront, values, onto)
         window = self.window(values)
@@ -441,15 +409,10 @@ class MovableStop(PupilOptic):
 
 
 def _cubic(array: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """Values of an array at positions in samples, by cubic convolution; zero outside.
-
-    Differentiable in forward and reverse mode, unlike torch's `grid_sample`.
-
-    Parameters
-    ----------
-    array : Tensor, (ny, nx)
-    rows, columns : Tensor, (...)
-    """
+    """Values of an array (ny, nx) at positions in samples, by cubic convolution; zero outside."""
+    # R. Keys, IEEE Trans. Acoust. Speech Signal Process. 29, 1153, 1981, with a = -1/2: weights at
+    # the distances 1 + t, t, 1 - t and 2 - t. Differentiable in forward and reverse mode, unlike
+    # torch's `grid_sample`.
     ny, nx = array.shape
     edge = 4  # Positions far outside are clamped to this margin of zeros.
     flat = torch.nn.functional.pad(array, (edge,) * 4).flatten()
@@ -504,20 +467,11 @@ class AberrationOptic(PupilOptic):
 
 @dataclass
 class Gain(Plane):
-    """A uniform factor; 1 for a plane without effect on the field.
-
-    Attributes
-    ----------
-    name : str
-    factor : complex
-        Amplitude transmission.
-    edge : PupilGrid or None
-        A window outside which the field is cut off.
-    """
+    """A uniform factor; 1 for a plane without effect on the field."""
 
     name: str
-    factor: complex = 1.0
-    edge: PupilGrid | None = None
+    factor: complex = 1.0  # amplitude transmission
+    edge: PupilGrid | None = None  # window outside which the field is cut off
     pointwise = True
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:

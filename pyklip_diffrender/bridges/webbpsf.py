@@ -77,10 +77,7 @@ def private_copy(nircam: Any) -> Any:
 def oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
     """Oversampling of the image planes and of the detector, by stpsf's rules.
 
-    Parameters
-    ----------
-    recipe : mapping
-        With "oversample", "fft_oversample" and "detector_oversample", each an int or None.
+    `recipe` has "oversample", "fft_oversample" and "detector_oversample", each an int or None.
     """
     common, fine, pixels = (
         recipe[name] for name in ("oversample", "fft_oversample", "detector_oversample")
@@ -102,21 +99,9 @@ def oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
 def band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[float]]:
     """Wavelengths (m) and weights: those of a `Bandpass`, otherwise the choice of stpsf.
 
-    Parameters
-    ----------
-    instrument : stpsf.NIRCam
-    recipe : mapping
-        With "bandpass", "monochromatic", "nlambda" and "source", each possibly None.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For a wavelength that the instrument's channel does not pass.
-
-    Warns
-    -----
-    DiffrenderWarning
-        For a single wavelength outside the filter.
+    `recipe` has "bandpass", "monochromatic", "nlambda" and "source", each possibly None.
+    IncompatibleSetupError for a wavelength that the instrument's channel does not pass; a warning
+    for a single one outside the filter.
     """
     bandpass: Bandpass | None = recipe["bandpass"]
     monochromatic = None
@@ -187,10 +172,7 @@ def with_effects(
 ) -> ChainDetector:
     """A detector with the effects of an instrument: all up to DET_DIST, or jitter only.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For a kind of jitter that is not supported.
+    IncompatibleSetupError for a kind of jitter that is not supported.
     """
     oversample, shape = detector.oversample, detector.shape
     scale = detector.pixelscale[0] / oversample
@@ -282,18 +264,11 @@ def _crosstalk(instrument: Any, header: Any) -> list[Array]:
 
 
 class WebbSystem(PoppySystem):
-    """A `PoppySystem` made from an stpsf instrument by `from_webbpsf`.
+    """A `PoppySystem` made from an stpsf instrument by `from_webbpsf`."""
 
-    Attributes
-    ----------
-    instrument : stpsf.NIRCam
-        The model's own copy, as of its conversion.
-    si_wfe_flipped : bool or None
-        Whether the map of the instrument's internal wavefront error is flipped vertically, as
-        stpsf does from 2.2.0 on; None without one.
-    """
-
-    instrument: Any
+    instrument: Any  # the model's own copy, as of its conversion
+    # Whether the map of the instrument's internal wavefront error is flipped vertically, as stpsf
+    # does from 2.2.0 on; None without one.
     si_wfe_flipped: bool | None
     _sources: ClassVar[tuple[str, ...]] = ("nircam", "trainable")
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
@@ -346,20 +321,11 @@ class WebbSystem(PoppySystem):
     ) -> Any:
         """PSF as an HDUList, with the arguments, extensions and keywords of stpsf's `calc_psf`.
 
-        Arguments that are not given keep the values that the system was made with. The image is
+        Arguments that are not given keep the values that the system was made with; `opd` and
+        parameters are as in a call of the system, for the PSF of a refined wavefront. The image is
         this system's; stpsf itself then adds jitter, distortion, detector effects and header.
-
-        Parameters
-        ----------
-        opd, **parameters
-            As in a call of the system, for the PSF of a refined wavefront.
-        display, save_intermediates
-            Accepted for compatibility with stpsf; nothing is drawn, and saving is refused.
-
-        Returns
-        -------
-        HDUList, or (HDUList, list of poppy.Wavefront)
-            OVERSAMP, DET_SAMP, OVERDIST and DET_DIST, the last two with `add_distortion`.
+        Extensions are OVERSAMP, DET_SAMP, and with `add_distortion` OVERDIST and DET_DIST. Nothing
+        is drawn, and saving intermediates is refused.
         """
         refuse_saving(save_intermediates)
         arguments = {

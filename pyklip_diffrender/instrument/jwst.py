@@ -67,12 +67,7 @@ def _mirror_coverage(grid: PupilGrid) -> Tensor:
 def is_jwst_pupil(lit: Tensor, diameter: float) -> bool:
     """Whether an aperture is JWST's primary mirror, up to struts and gaps.
 
-    Parameters
-    ----------
-    lit : Tensor of bool, (npix, npix)
-        Samples that transmit light.
-    diameter : float
-        Side of the array, m.
+    `lit` are the samples that transmit light, (npix, npix); `diameter` is the array's side, m.
     """
     mirror = _mirror_coverage(PupilGrid.full(len(lit), diameter))
     lit, full = lit.cpu(), mirror > 0.99
@@ -83,31 +78,16 @@ def is_jwst_pupil(lit: Tensor, diameter: float) -> bool:
 
 
 def jwst_pupil(npix: int, segment_gap: float | None = None, pupil: str = "design") -> Tensor:
-    """Amplitude transmission of the JWST entrance pupil.
+    """Amplitude transmission of JWST's entrance pupil, (npix, npix) over 6.603464 m, float64.
 
-    Parameters
-    ----------
-    npix : int
-        Samples across 6.603464 m.
-    segment_gap : float, optional
-        Width of the gaps between the segments, m, set by moving all segment edges equally. Default
-        that of the embedded outlines, 7.7 mm.
-    pupil : "design" or "flight"
-        Obscurations by the struts of the secondary mirror: as designed (stpsf's pupil "RevW"), or
-        as in NIRCam's pupil images ("Flight V1": the vertical strut is 7 % narrower, and all three
-        have hinges). Behind MASK335R in F444W the star's image differs by 0.6 to 1.3 % of its local
-        intensity; a map of 1024 samples and these outlines differ by 0.1 to 0.2 %.
-
-    Returns
-    -------
-    Tensor, (npix, npix), float64
-        Covered fraction of the area of each pixel.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For another `pupil`.
+    It is the covered fraction of a pixel's area. `segment_gap` is the width of the gaps between the
+    segments, m, by default that of the embedded outlines, 7.7 mm. IncompatibleSetupError for a
+    `pupil` other than "design" or "flight".
     """
+    # Struts of the secondary mirror as designed (stpsf's pupil "RevW"), or as in NIRCam's pupil
+    # images ("Flight V1": the vertical strut is 7 % narrower, and all three have hinges). Behind
+    # MASK335R in F444W the star's image differs by 0.6 to 1.3 % of its local intensity; a map of
+    # 1024 samples and these outlines differ by 0.1 to 0.2 %.
     kinds = {"design": "strut", "flight": "flight_strut"}
     if pupil not in kinds:
         raise IncompatibleSetupError(f"pupil: got {pupil!r}, expected 'design' or 'flight'")
@@ -117,6 +97,7 @@ def jwst_pupil(npix: int, segment_gap: float | None = None, pupil: str = "design
     grid = PupilGrid.full(fine)
     outlines = list(jwst_segments().values())
     if segment_gap is not None:
+        # A gap becomes narrower by twice as much as each of the edges beside it moves outwards.
         growth = (TABULATED_GAP - segment_gap) / 2
         outlines = [widen_polygon(outline, growth) for outline in outlines]
     # Outlines without gaps overlap by up to a tenth of a millimetre where three of them meet.

@@ -45,21 +45,10 @@ their frames at once."""
 
 @dataclass(frozen=True)
 class RoundMask:
-    """A round occulter.
-
-    Its amplitude transmission is ``t = 1 - (2 J1(s) / s)^2`` with ``s = sigma r`` up to the second
-    zero of J1, and 1 beyond (Krist et al., "The JWST/NIRCam coronagraph: mask design and
-    fabrication", Proc. SPIE 7440, 2009).
-
-    Attributes
-    ----------
-    name : str
-    sigma : float
-        Scale of the profile, per arcsec (stpsf 2.2.0, class ``NIRCam_BandLimitedCoron``).
-    """
+    """A round occulter."""
 
     name: str
-    sigma: float
+    sigma: float  # scale of the profile, per arcsec (stpsf 2.2.0, NIRCam_BandLimitedCoron)
 
     stop = "MASKRND"
     """The Lyot stop that is made for it."""
@@ -75,15 +64,11 @@ class RoundMask:
         return self.radius, self.radius
 
     def complement(self, x: Tensor, y: Tensor) -> Tensor:
-        """Amplitude that the mask removes, 1 - t.
-
-        It is computed directly, because 1 - t by subtraction loses its digits near the centre.
-
-        Parameters
-        ----------
-        x, y : Tensor
-            Angles from the centre of the mask, arcsec, broadcast against each other.
-        """
+        """Amplitude that the mask removes, 1 - t, at x, y (broadcast) from its centre in arcsec."""
+        # t = 1 - (2 J1(s) / s)^2 with s = sigma r up to the second zero of J1, and 1 beyond (Krist
+        # et al., "The JWST/NIRCam coronagraph: mask design and fabrication", Proc. SPIE 7440,
+        # 2009). 1 - t is computed directly, because by subtraction it loses its digits near the
+        # centre.
         s = self.sigma * torch.hypot(*torch.broadcast_tensors(x, y))
         safe = torch.where(s > 0, s, 1.0)
         jinc = torch.where(s > 0, 2 * torch.as_tensor(j1(safe.numpy())) / safe, 1.0)
@@ -92,30 +77,15 @@ class RoundMask:
 
 @dataclass(frozen=True)
 class BarMask:
-    """A bar of 20 arcsec along x that becomes wider in its middle part, a wedge.
-
-    Its amplitude transmission is ``t = 1 - (sin(s) / s)^2`` with ``s = sigma(x) |y|`` up to 2 pi,
-    and 1 beyond, and beyond the ends of the bar (Krist et al., see `RoundMask`).
-
-    Attributes
-    ----------
-    name : str
-    widens : int
-        Whether the bar becomes wider towards +x (1) or -x (-1), in the image.
-    scale : Polynomial
-        ``sigma``, per arcsec, as a function of the half width of the bar in lambda/D (stpsf
-        2.2.0, class ``NIRCam_BandLimitedCoron``).
-    offset : float
-        x of the star from the middle of the bar, arcsec.
-    longest : float or None
-        Distance from the star along x up to which the bar is modelled, arcsec; None is all of it.
-    """
+    """A bar of 20 arcsec along x that becomes wider in its middle part, a wedge."""
 
     name: str
-    widens: int
+    widens: int  # towards +x (1) or -x (-1), in the image
+    # sigma, per arcsec, of the half width of the bar in lambda/D (stpsf 2.2.0, class
+    # NIRCam_BandLimitedCoron).
     scale: Polynomial
-    offset: float = 0.0
-    longest: float | None = None
+    offset: float = 0.0  # x of the star from the middle of the bar, arcsec
+    longest: float | None = None  # modelled up to this x from the star, arcsec; None is all
 
     stop = "MASKBAR"
     """The Lyot stop that is made for it."""
@@ -123,18 +93,16 @@ class BarMask:
     @property
     def reach(self) -> tuple[float, float]:
         """Half the sides of the rectangle about the star beyond which the mask is clear, arcsec."""
+        # The mask is clear from s = sigma |y| = 2 pi on, which is farthest out where the bar is
+        # widest.
         x = min(_HALF_BAR + abs(self.offset), self.longest or math.inf)
         widest = self._width(torch.tensor([-x, x], dtype=torch.float64) + self.offset).max()
         return x, 2 * math.pi / float(self.scale(float(widest)))
 
     def complement(self, x: Tensor, y: Tensor) -> Tensor:
-        """Amplitude that the mask removes, 1 - t.
-
-        Parameters
-        ----------
-        x, y : Tensor
-            Angles from the star's place on the bar, arcsec, broadcast against each other.
-        """
+        """Amplitude that the mask removes, 1 - t, at x, y (broadcast) from the star in arcsec."""
+        # t = 1 - (sin(s) / s)^2 with s = sigma(x) |y| up to 2 pi, and 1 beyond, and beyond the ends
+        # of the bar (Krist et al., see `RoundMask`).
         x, y = torch.broadcast_tensors(x, y)
         on_bar = x + self.offset
         s = torch.as_tensor(self.scale(self._width(on_bar).numpy())) * y.abs()
@@ -186,35 +154,21 @@ MASKS: dict[str, RoundMask | BarMask] = {
 
 @dataclass(frozen=True)
 class DetectorPlace:
-    """Where a mask is imaged on a detector, and the pixels there.
-
-    Attributes
-    ----------
-    mask : str
-    place : str
-        Place along a bar: a filter, at whose fiducial it is, or "NARROW"; "-" is the middle.
-    detector : str
-        As SIAF names it: NRCA2, NRCA4, NRCB1 or NRCB3 (short wave), NRCA5 or NRCB5 (long wave).
-    center : tuple of float
-        x, y of the mask on the full detector in F335M (short wave: F210M), pixels of the science
-        frame counted from 0 at the middle of the first one. In another filter add `filter_shift`.
-        In module B it is that of the SIAF, which in module A is up to 3.4 pixels away.
-    siaf_pixelscale : tuple of float
-        arcsec per pixel in x and y (SIAF, PRDOPSSOC-075).
-    siaf_shear : float
-        Growth of the ideal y with the ideal x, from the SIAF polynomial: the mean over +-40
-        pixels.
-    offset : float
-        x of the place from the middle of a bar, arcsec.
-    """
+    """Where a mask is imaged on a detector, and the pixels there."""
 
     mask: str
+    # Place along a bar: a filter, at whose fiducial it is, or "NARROW"; "-" is the middle.
     place: str
+    # As SIAF names it: NRCA2, NRCA4, NRCB1 or NRCB3 (short wave), NRCA5 or NRCB5 (long wave).
     detector: str
+    # x, y of the mask on the full detector in F335M (short wave: F210M), pixels of the science
+    # frame counted from 0 at the middle of the first one. In another filter add `filter_shift`. In
+    # module B it is that of the SIAF, which in module A is up to 3.4 pixels away.
     center: tuple[float, float]
-    siaf_pixelscale: tuple[float, float]
+    siaf_pixelscale: tuple[float, float]  # x, y, arcsec per pixel (SIAF, PRDOPSSOC-075)
+    # Growth of the ideal y with the ideal x, from the SIAF polynomial: the mean over +-40 pixels.
     siaf_shear: float
-    offset: float
+    offset: float  # x of the place from the middle of a bar, arcsec
 
     @property
     def pixelscale(self) -> float:
@@ -224,11 +178,10 @@ class DetectorPlace:
     def period(self, bar_reach: float | None = None) -> float:
         """Least period of the star's image, arcsec, for a copy of it not to touch a bar.
 
-        Parameters
-        ----------
-        bar_reach : float, optional
-            See `nircam_coronagraph`.
+        `bar_reach` is that of `nircam_coronagraph`.
         """
+        # The copy of the star, of a radius of its own, one period away is then beyond the end of
+        # the bar.
         mask = MASKS[self.mask]
         if isinstance(mask, RoundMask):
             return 0.0
@@ -270,10 +223,7 @@ def _places() -> dict[tuple[str, str, bool, str], DetectorPlace]:
 def is_short_wave(filter: str) -> bool:
     """Whether a filter is one of the short-wave channel.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For a filter that does not go with the coronagraph.
+    IncompatibleSetupError for a filter that does not go with the coronagraph.
     """
     if filter.upper() not in FILTERS:
         raise IncompatibleSetupError(
@@ -284,13 +234,7 @@ def is_short_wave(filter: str) -> bool:
 
 
 def require_mask(mask: str) -> RoundMask | BarMask:
-    """Return the mask of this name.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For a name that is not one of `MASKS`.
-    """
+    """Return the mask of this name; IncompatibleSetupError if it is not one of `MASKS`."""
     if mask not in MASKS:
         raise IncompatibleSetupError(
             f"image_mask: got {mask!r}, expected None or one of {', '.join(MASKS)}"
@@ -303,31 +247,11 @@ def detector_place(
 ) -> DetectorPlace:
     """Where a mask is imaged in a filter, and the pixels there.
 
-    Parameters
-    ----------
-    mask : str or None
-        Image mask. None gives the place of the mask that is made for the filter's channel
-        (MASK210R or MASK335R).
-    filter : str
-        Filter, in any case.
-    place : str, optional
-        Place of the star along a bar: a filter of its channel, at whose fiducial it is, "NARROW",
-        or "-", the middle. Default the fiducial of `filter`, or the middle if it has none.
-    module : "A" or "B"
-        In B there are MASK210R and MASKSWB in the short-wave channel, MASK335R, MASK430R and
-        MASKLWB in the long-wave one, and no place along a bar but the middle.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For an unknown mask, filter, place or module, or a mask that the module does not have in
-        the filter's channel.
-
-    Examples
-    --------
-    >>> from pyklip_diffrender.instrument import detector_place
-    >>> detector_place("MASK335R", "F210M").detector
-    'NRCA2'
+    Without a mask it is the place of the one that is made for the filter's channel
+    (MASK210R or MASK335R). `place` is that of the star along a bar: a filter of its channel, at
+    whose fiducial it is, "NARROW", or "-", the middle; default the fiducial of `filter`, or the
+    middle if it has none. IncompatibleSetupError for an unknown mask, filter, place or module, or a
+    mask that the module does not have in the filter's channel.
     """
     short_wave = is_short_wave(filter)
     if mask is None:
@@ -336,6 +260,8 @@ def detector_place(
     if module not in ("A", "B"):
         raise IncompatibleSetupError(f"module: got {module!r}, expected 'A' or 'B'")
     places = _places()
+    # In B there are MASK210R and MASKSWB in the short-wave channel, MASK335R, MASK430R and MASKLWB
+    # in the long-wave one, and no place along a bar but the middle.
     if (mask, "-", short_wave, module) not in places:
         there = [f"{each.mask} ({each.detector})" for each in places.values() if each.module == "B"]
         raise IncompatibleSetupError(
@@ -355,18 +281,9 @@ def detector_place(
 
 
 def stop_is_measured(mask: str | None, short_wave: bool, module: str | None = None) -> bool:
-    """Whether the alignment of the Lyot stop was measured in flight.
-
-    That of MASKRND was, in the long-wave channel of module A.
-
-    Parameters
-    ----------
-    mask : str or None
-        Image mask; the stop is MASKRND but for a bar.
-    short_wave : bool
-    module : "A" or "B", optional
-        Default A.
-    """
+    """Whether the alignment of the Lyot stop of a mask was measured in flight."""
+    # That of MASKRND, the stop of all masks but the bars, was measured in the long-wave channel of
+    # A.
     is_bar = isinstance(MASKS.get(mask or ""), BarMask)
     return not is_bar and not short_wave and module != "B"
 
@@ -379,6 +296,7 @@ def mask_of_header(value: object) -> str:
     return re.sub(r"^MASK[AB](?=\d|[LS]WB)", "MASK", str(value).strip().upper())
 
 
+# The filters' substrates and the coronagraph's wedge displace the image by up to two pixels.
 # J. Leisenring's measurements in flight with module A, as in spaceKLIP's resources
 # filter_shifts_jarron.json (commit 07eaf7d).
 _SHIFTS = {
@@ -404,23 +322,8 @@ _SHIFTS = {
 def filter_shift(name: str) -> tuple[float, float]:
     """How far the image of the mask, and of the sky with it, lies from where it is in F335M.
 
-    The filters' substrates and the coronagraph's wedge displace the image by up to two pixels. It
-    was measured in module A.
-
-    Parameters
-    ----------
-    name : str
-        Filter. Those of the short-wave channel are relative to F210M.
-
-    Returns
-    -------
-    tuple of float
-        x, y in pixels of the filter's channel, science frame.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For a filter whose shift was not measured.
+    x, y in pixels of the filter's channel, science frame; short-wave filters are relative to F210M.
+    IncompatibleSetupError for a filter whose shift was not measured.
     """
     if name.upper() not in _SHIFTS:
         raise IncompatibleSetupError(

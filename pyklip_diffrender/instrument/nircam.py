@@ -73,16 +73,7 @@ _MIRRORED = {"MASKSWB": "MASKLWB", "MASKLWB": "MASKSWB"}
 class ChromaticAberration:
     """Focus and wedge tilt in addition to the tabulated wavefront error.
 
-    In the exit pupil the additional OPD is ``-(focus(lambda) - focus(tabulated)) Z4 +
-    (tilt(lambda) - tilt(reference)) Z3``; y is inverted in the entrance pupil, which changes the
-    sign of Z3.
-
-    Parameters
-    ----------
-    reference : float
-        Wavelength at which the tilt is zero, m.
-    short_wave : bool
-        Whether it is that of the short-wave channel.
+    The tilt is zero at the wavelength `reference`, m.
     """
 
     def __init__(self, reference: float, short_wave: bool = False) -> None:
@@ -90,6 +81,9 @@ class ChromaticAberration:
 
     def __call__(self, wavelength: float) -> dict[int, float]:
         """Coefficients to add at a wavelength (m): Noll index to m rms."""
+        # In the exit pupil the additional OPD is -(focus(lambda) - focus(tabulated)) Z4 +
+        # (tilt(lambda) - tilt(reference)) Z3; y is inverted in the entrance pupil, which changes
+        # the sign of Z3.
         channel = 0 if self.short_wave else 1
         focus, tilt = _FOCUS[channel], _WEDGE_TILT[channel]
         return {
@@ -101,28 +95,17 @@ class ChromaticAberration:
 def internal_wavefront_error(
     mask: str = "MASK335R", flip: bool = True, *, short_wave: bool = False, module: str = "A"
 ) -> Tensor:
-    """NIRCam's internal wavefront error at a mask.
+    """NIRCam's internal wavefront error at a mask: Noll coefficients in m, (36,), float64.
 
-    Parameters
-    ----------
-    mask : str
-        A name of `MASKS`.
-    flip : bool
-        Flip the map vertically, as stpsf does from 2.2.0 on, because that matches images in flight
-        better. False uses the tabulated orientation, that of the exit pupil, as stpsf did before.
-    short_wave : bool
-        In the short-wave channel, otherwise in the long-wave one.
-    module : "A" or "B"
-        STScI's table has the same values for B as for A, at places mirrored in V2. There the two
-        bars change places.
-
-    Returns
-    -------
-    Tensor, (36,), float64
-        Noll coefficients in m, for the entrance-pupil orientation used here.
+    They are in entrance-pupil orientation, of the map flipped vertically; with `flip` False of the
+    map in the tabulated orientation, that of the exit pupil, as stpsf took it before 2.2.0.
     """
+    # STScI's table has the same values for B as for A, at places mirrored in V2. There the two bars
+    # change places.
     if module == "B":
         mask = _MIRRORED.get(mask, mask)
+    # stpsf flips the map from 2.2.0 on, because that matches images in flight better. The flip
+    # cancels the inversion of y between exit and entrance pupil.
     exit_pupil = torch.tensor(_table(mask, short_wave), dtype=torch.float64) * 1e-9
     return exit_pupil if flip else exit_pupil * parity_in_y(len(exit_pupil))
 

@@ -61,10 +61,7 @@ def _throughputs() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Wavelengths (m) and relative response (peak 1) of a filter, to be interpolated linearly.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        If the filter has no embedded throughput.
+    IncompatibleSetupError if the filter has no embedded throughput.
     """
     try:
         return _throughputs()[name.upper()]
@@ -76,15 +73,8 @@ def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def blackbody(temperature: float, wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """Photons per unit wavelength of a blackbody, up to a constant.
-
-    Parameters
-    ----------
-    temperature : float
-        K.
-    wavelengths : array_like
-        m.
-    """
+    """Photons per unit wavelength of a blackbody of `temperature` (K), at wavelengths in m."""
+    # B_lambda / (h c / lambda) is proportional to lambda^-4 / (exp(h c / lambda k T) - 1).
     exponent = (constants.h * constants.c / constants.k_B).to_value(u.m * u.K) / (
         native_float64(wavelengths) * temperature
     )
@@ -98,28 +88,17 @@ def filter_bandpass(
 ) -> Bandpass:
     """Divide a filter into `nlambda` equal intervals and weight each by its detected photons.
 
-    Every wavelength is the photon-weighted mean of its interval, for the best accuracy with few
-    wavelengths.
-
-    Parameters
-    ----------
-    name : str
-        Filter.
-    nlambda : int
-        Number of intervals between the wavelengths at which the throughput is 1 % of its peak;
-        intervals without light are omitted.
-    source : float or (wavelengths, flux)
-        Temperature of a blackbody in K (default as in stpsf), or a spectrum: wavelengths in m
-        and photons per unit wavelength; either may be a Quantity.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For an unknown filter, or a spectrum that does not cover it or has no light in it.
+    `source` is the temperature of a blackbody in K (default as in stpsf), or a spectrum:
+    wavelengths in m and photons per unit wavelength; either may be a Quantity.
+    IncompatibleSetupError for an unknown filter, or a spectrum that does not cover it or has no
+    light in it.
     """
     if nlambda < 1:
         raise ValueError(f"nlambda: got {nlambda}, expected at least 1")
     wavelength, throughput = filter_throughput(name)
+    # Intervals are between the wavelengths at which the throughput is 1 % of its peak; those
+    # without light are omitted. Every wavelength is the photon-weighted mean of its interval, for
+    # the best accuracy with few wavelengths.
     # The table has few points, so the throughput is interpolated to find where it passes 1 %.
     dense = np.linspace(wavelength[0], wavelength[-1], 20_001)
     used = dense[np.interp(dense, wavelength, throughput) > 0.01 * throughput.max()]
@@ -171,24 +150,10 @@ def is_dwarf(star: str) -> bool:
 
 
 def dwarf_photometry(star: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Samples of the spectrum of a dwarf.
+    """Samples of the spectrum of a dwarf, wavelengths in m and flux densities in Jy.
 
-    W1 - W2 is interpolated from K5 to M5, between which the table has no value.
-
-    Parameters
-    ----------
-    star : str
-        Spectral type from B5 to M9 and magnitude in Ks, such as "A2V, K=6.77".
-
-    Returns
-    -------
-    wavelength, flux : ndarray
-        m and Jy.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For another description, or a type that the table does not have.
+    `star` has a spectral type from B5 to M9 and the magnitude in Ks, such as "A2V, K=6.77".
+    IncompatibleSetupError for another description, or a type that the table does not have.
     """
     match = _DESCRIPTION.fullmatch(star)
     if match is None:
@@ -202,6 +167,7 @@ def dwarf_photometry(star: str) -> tuple[NDArray[np.float64], NDArray[np.float64
         raise IncompatibleSetupError(
             f"star: got type {match['type']}, expected {table['type'][0]} to {table['type'][-1]}"
         )
+    # W1 - W2 is interpolated from K5 to M5, between which the table has no value.
     j_h, h_ks, ks_w1, w1_w2 = (
         _interpolated(place, places, native_float64(table[name]))
         for name in ("j_h", "h_ks", "ks_w1", "w1_w2")
@@ -209,6 +175,7 @@ def dwarf_photometry(star: str) -> tuple[NDArray[np.float64], NDArray[np.float64
     ks = float(match["magnitude"])
     magnitudes = native_float64([ks + h_ks + j_h, ks + h_ks, ks, ks - ks_w1, ks - ks_w1 - w1_w2])
     flux = _ZERO_POINTS * 10 ** (-0.4 * magnitudes)
+    # F = a lambda^slope through W1 and W2.
     slope = np.log(flux[-1] / flux[-2]) / np.log(_WAVELENGTHS[-1] / _WAVELENGTHS[-2])
     end = flux[-1] * (_END / _WAVELENGTHS[-1]) ** slope
     return np.append(_WAVELENGTHS, _END), np.append(flux, end)
@@ -290,22 +257,10 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
 def mean_in_filter(
     grid: NDArray[np.float64], flux: NDArray[np.float64], filter: str, name: str
 ) -> float:
-    """Mean of a flux density over the photons that a filter detects; see `star_flux_density`.
+    """Mean of a flux density per frequency over the photons that a filter detects.
 
-    Parameters
-    ----------
-    grid : ndarray, (n,)
-        Wavelengths, m, increasing.
-    flux : ndarray, (n,)
-        Flux density per frequency, positive.
-    filter : str
-    name : str
-        Of the spectrum, for the message.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For an unknown filter, or a spectrum that does not cover it.
+    Wavelengths `grid`, m, increase, and the `flux` is positive, both (n,). IncompatibleSetupError
+    for an unknown filter, or a spectrum that does not cover it.
     """
     wavelength, throughput = filter_throughput(filter)
     inside = throughput > 0.01 * throughput.max()
@@ -324,31 +279,18 @@ def mean_in_filter(
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
-    """Read a spectrum.
+    """Read a spectrum: wavelengths, m, increasing, and flux densities, Jy.
 
-    Parameters
-    ----------
-    path : path
-        - A text file of two columns without units: wavelength in micron and flux density in Jy, as
-          the ``starfile`` of spaceKLIP. Lines that begin with ``#`` are comments.
-        - A table with units (ECSV, FITS), whose first two columns are wavelengths or frequencies,
-          and flux densities by wavelength or frequency, such as the spectra of CALSPEC.
-        - Photometry as the VizieR photometry viewer saves it (VOTable with ``sed_freq`` and
-          ``sed_flux``). Points at one frequency are averaged by their median.
+    - A text file of two columns without units: wavelength in micron and flux density in Jy, as
+      the ``starfile`` of spaceKLIP. Lines that begin with ``#`` are comments.
+    - A table with units (ECSV, FITS), whose first two columns are wavelengths or frequencies,
+      and flux densities by wavelength or frequency, such as the spectra of CALSPEC.
+    - Photometry as the VizieR photometry viewer saves it (VOTable with ``sed_freq`` and
+      ``sed_flux``). Points at one frequency are averaged by their median.
 
-    Returns
-    -------
-    wavelength, flux : ndarray
-        m, increasing, and Jy.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    CorruptFileError
-        If it is not one of these, or has no positive flux.
-    IncompatibleSetupError
-        If its samples between 2 and 5.2 micron are too far apart for interpolation.
+    FileNotFoundError if there is no such file, CorruptFileError if it is not one of these, or has
+    no positive flux, IncompatibleSetupError if its samples between 2 and 5.2 micron are too far
+    apart for interpolation.
     """
     path = Path(path)
     if not path.is_file():
@@ -440,23 +382,14 @@ _SAMPLES = np.geomspace(0.5e-6, 8e-6, 2001)
 
 @dataclass(frozen=True)
 class PlanetSpectra:
-    """Flux densities of planets in several filters.
+    """Flux densities of planets in several filters."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the spectra.
-    filters : tuple of str
-    flux : ndarray, (spectra, filters)
-        Mean flux density per frequency over the photons that the filter detects, 1 in the filter
-        where it is largest.
-    left_out : tuple of (str, str)
-        Spectra of a file that do not cover a filter or have no light in it, and why.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the spectra
     filters: tuple[str, ...]
+    # (spectra, filters): mean flux density per frequency over the photons that the filter detects,
+    # 1 in the filter where it is largest.
     flux: NDArray[np.float64]
+    # Spectra of a file that do not cover a filter or have no light in it, and why.
     left_out: tuple[tuple[str, str], ...] = ()
 
 

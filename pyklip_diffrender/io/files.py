@@ -63,13 +63,7 @@ _SUFFIX = re.compile(r"\.(fits?|fts)(\.gz|\.fz)?$", re.IGNORECASE)
 
 
 def is_fits_name(path: str | os.PathLike[str]) -> bool:
-    """Whether a path has the suffix of a FITS file, packed or not, in any case.
-
-    Examples
-    --------
-    >>> [is_fits_name(name) for name in ("a.fits", "B.FIT.GZ", "c.fts", "d.fits.fz", "e.txt")]
-    [True, True, True, True, False]
-    """
+    """Whether a path has the suffix of a FITS file, packed or not, in any case ("B.FIT.GZ")."""
     return _SUFFIX.search(os.fspath(path)) is not None
 
 
@@ -105,26 +99,11 @@ def read_text(path: str | os.PathLike[str]) -> str:
 def open_fits(path: str | os.PathLike[str], *, images: bool = True) -> Iterator[fits.HDUList]:
     """Open a FITS file, packed by gzip or fpack or not, and read all of it.
 
-    Parameters
-    ----------
-    path : path
-    images : bool
-        Read the images, too. If not, `read_image` reads them, one plane at a time, so that a file
-        of many integrations is never in memory as a whole.
-
-    Raises
-    ------
-    MissingFileError
-        If there is no such file; it is also a `FileNotFoundError`.
-    CorruptFileError
-        If the file is truncated, or not FITS, if a card cannot be read, or if data do
-        not match DATASUM.
-
-    Warns
-    -----
-    DiffrenderWarning
-        If only a header does not match its CHECKSUM, as after editing it without an update of the
-        checksum.
+    Without `images`, `read_image` reads them, one plane at a time, so that a file of many
+    integrations is never in memory as a whole. MissingFileError, also a FileNotFoundError, if there
+    is no such file; CorruptFileError if it is truncated, or not FITS, if a card cannot be read, or
+    if data do not match DATASUM; a DiffrenderWarning if only a header does not match its CHECKSUM,
+    as after editing it without an update of the checksum.
     """
     path = Path(path)
     if not path.is_file():
@@ -196,21 +175,9 @@ def _float64(image: Any) -> NDArray[np.float64]:
 def read_image(
     hdu: Any, path: str | os.PathLike[str], convert: Callable[[Any], NDArray[Any]] = _float64
 ) -> NDArray[Any]:
-    """Read the image of an HDU, plane by plane, into an array of its own.
+    """Read the image of an HDU, plane by plane, into an array of its own; see `open_fits`.
 
-    Parameters
-    ----------
-    hdu : ImageHDU, PrimaryHDU or CompImageHDU
-        Of a file that `open_fits` has opened.
-    path : path
-        Of the file, for messages.
-    convert : callable
-        Makes a plane of the array from a plane of the file.
-
-    Raises
-    ------
-    CorruptFileError
-        If the image cannot be read.
+    `convert` makes a plane of the array from a plane of the file; CorruptFileError if that fails.
     """
     shape = tuple(hdu.shape)
     try:
@@ -283,13 +250,7 @@ def _folded(total: int) -> int:
 
 
 def require_new(paths: Iterable[str | os.PathLike[str]], overwrite: bool) -> None:
-    """Check, before anything is written, that no file is replaced unless that is wanted.
-
-    Raises
-    ------
-    ExistingFileError
-        If one of the files exists, and `overwrite` is False.
-    """
+    """Raise ExistingFileError, before anything is written, for files that must not be replaced."""
     existing = [str(path) for path in paths if os.path.lexists(path)]
     if existing and not overwrite:
         verb = "exists" if len(existing) == 1 else "exist"
@@ -300,12 +261,10 @@ def require_new(paths: Iterable[str | os.PathLike[str]], overwrite: bool) -> Non
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Temporary path for a file that replaces `path` if the block succeeds.
-
-    It is in the same folder, so that the replacement is one step, and has the same suffix, on which
-    some writers depend (``.fits.gz``, ``.png``). The product has the permissions of the file that
-    it replaces, or those of any new file.
-    """
+    """Temporary path, in the same folder, for a file that replaces `path` if the block succeeds."""
+    # In the same folder the replacement is one step. The suffix is the same
+    # (``.fits.gz``, ``.png``), because some writers depend on it. The product has the permissions
+    # of the file that it replaces, or those of any new file.
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = "".join(path.suffixes)

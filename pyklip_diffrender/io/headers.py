@@ -51,27 +51,15 @@ _SIGN = re.compile(r"\+(?=\s*\d)")
 def same_name(first: str | None, second: str | None) -> bool:
     """Whether two names differ only in case, separators and SIMBAD's marks before the name.
 
-    A plus sign before digits counts. A minus sign cannot be told from a dash.
-
-    Examples
-    --------
-    >>> same_name("V* AU Mic", "au-mic"), same_name("BD+20-1790", "BD-20-1790")
-    (True, False)
+    "V* AU Mic" is "au-mic". A plus sign before digits counts: "BD+20-1790" is not "BD-20-1790". A
+    minus sign cannot be told from a dash.
     """
     names = [str(each) for each in (first, second)]
     return _plain(names[0]) == _plain(names[1]) or _bare(names[0]) == _bare(names[1])
 
 
 def unknown_name(key: str, choice: str, names: Iterable[str | None]) -> IncompatibleSetupError:
-    """Error for a name that is not among those there are, with the one that may be meant.
-
-    Examples
-    --------
-    >>> print(unknown_name("target", "HIP 17659", ["HIP 17695", "AU Mic"]))
-    target: got 'HIP 17659', expected one of 'AU Mic', 'HIP 17695'. Did you mean 'HIP 17695'?
-    >>> print(unknown_name("target", "HIP 1234", ["HIP 17695", "AU Mic"]))
-    target: got 'HIP 1234', expected one of 'AU Mic', 'HIP 17695'
-    """
+    """Error for a name that is not among those there are, with the one that may be meant."""
     known = sorted({str(name) for name in names})
     # Another number is another star, however alike the names are.
     by_plain = {_plain(name): name for name in known if _alike_numbers(choice, name)}
@@ -112,12 +100,8 @@ _UNKNOWN = ("", "UNKNOWN", "NULL", "N/A", "UNDEFINED")
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
     """Cards of the primary header, replaced and completed by those of an extension.
 
-    `name` is the name of the file in messages.
-
-    Raises
-    ------
-    CorruptFileError
-        If a card cannot be read, or has invalid characters.
+    CorruptFileError, with the `name` of the file, if a card cannot be read, or has invalid
+    characters.
     """
     merged = primary.copy()
     try:
@@ -131,14 +115,9 @@ def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fi
 
 
 def fits_text(text: object) -> str:
-    """Return a text as FITS headers can hold it, in printable ASCII.
+    """Return a text as FITS headers can hold it, in printable ASCII ("Übersicht β": "Ubersicht ?").
 
     Accents are left out, and other characters become question marks.
-
-    Examples
-    --------
-    >>> fits_text("Übersicht β Pic.fits")
-    'Ubersicht ? Pic.fits'
     """
     plain = unicodedata.normalize("NFKD", str(text))
     letters = (c for c in plain if not unicodedata.combining(c))
@@ -160,14 +139,9 @@ def _value(header: fits.Header, key: str) -> Any:
 
 
 def header_number(header: fits.Header, key: str, name: str) -> float | None:
-    """Finite number of a card; `name` is that of the file.
+    """Finite number of a card; CorruptFileError if it holds something else.
 
     None if the card is missing, empty, or says that its value is not known.
-
-    Raises
-    ------
-    CorruptFileError
-        If the card holds something else.
     """
     value = _value(header, key)
     if value is None or (isinstance(value, str) and value.strip().upper() in _UNKNOWN):
@@ -178,14 +152,9 @@ def header_number(header: fits.Header, key: str, name: str) -> float | None:
 
 
 def header_text(header: fits.Header, key: str, name: str) -> str | None:
-    """Text of a card without blanks around it; `name` is that of the file.
+    """Text of a card, without blanks around it; CorruptFileError if it holds something else.
 
     None if the card is missing, empty, or says that its value is not known (UNKNOWN, NULL, N/A).
-
-    Raises
-    ------
-    CorruptFileError
-        If the card holds something else.
     """
     value = _value(header, key)
     if value is not None and not isinstance(value, str):
@@ -195,13 +164,7 @@ def header_text(header: fits.Header, key: str, name: str) -> str | None:
 
 
 def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time | None:
-    """Date (UTC) of the first of several cards that has one; `name` is that of the file.
-
-    Raises
-    ------
-    CorruptFileError
-        If the card does not hold a date.
-    """
+    """Date (UTC) of the first of several cards that has one; CorruptFileError if it is no date."""
     for key in keys:
         text = header_text(header, key, name)
         if text is None:
@@ -214,12 +177,9 @@ def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time |
 
 
 def day_and_time(header: fits.Header, name: str) -> Time | None:
-    """Date (UTC) of DATE-OBS with TIME-OBS, None if one of them is missing; `name` is the file's.
+    """Date (UTC) of DATE-OBS with TIME-OBS, None if one of them is missing.
 
-    Raises
-    ------
-    CorruptFileError
-        If together they are no date.
+    CorruptFileError if together they are no date.
     """
     day, hour = (header_text(header, key, name) for key in ("DATE-OBS", "TIME-OBS"))
     if not (day and hour) or "T" in day:
@@ -236,12 +196,7 @@ def sensing_date(header: fits.Header, name: str) -> Time | None:
     """Date (UTC) at which a wavefront map was sensed, None if it is not known.
 
     It is DATE-OBS with TIME-OBS, as MAST and stpsf write them, DATE-OBS alone, DATE-BEG, or else
-    the date in the name of the file, `name`.
-
-    Raises
-    ------
-    CorruptFileError
-        If the cards do not hold a date.
+    the date in the name of the file, `name`. CorruptFileError if the cards do not hold a date.
     """
     split = day_and_time(header, name)
     if split is not None:
@@ -263,24 +218,14 @@ _PIPELINE = u.MJy / u.sr
 
 @dataclass(frozen=True)
 class Keyword:
-    """A keyword of products.
-
-    Attributes
-    ----------
-    name : str
-    comment : str
-        Comment of the card; empty where the value leaves no room for one.
-    files : str
-        "reduce" for files of reductions, fits and searches, "pyKLIP" for products of
-        ``algo="diffrender"``, "psf" for rendered images; several are separated by commas.
-    meaning : str
-        What the comment leaves out, for the documentation.
-    """
+    """A keyword of products."""
 
     name: str
-    comment: str
+    comment: str  # of the card; empty where the value leaves no room for one
+    # "reduce" for files of reductions, fits and searches, "pyKLIP" for products of
+    # ``algo="diffrender"``, "psf" for rendered images; several are separated by commas.
     files: str
-    meaning: str = ""
+    meaning: str = ""  # what the comment leaves out, for the documentation
 
 
 _DECLARED = (
@@ -341,20 +286,9 @@ KEYWORDS = {each.name: each for each in _DECLARED}
 
 
 def set_keyword(header: fits.Header, name: str, value: Any) -> None:
-    """Set one of the package's keywords, with its comment.
+    """Set one of the package's keywords, with its comment; KeyError if it is not declared.
 
-    Parameters
-    ----------
-    header : Header
-        Changed.
-    name : str
-    value : str, bool, int or float
-        Numbers that are not finite, which FITS headers cannot have, are written as text.
-
-    Raises
-    ------
-    KeyError
-        For a keyword that is not declared.
+    Numbers that are not finite, which FITS headers cannot have, are written as text.
     """
     comment = KEYWORDS[name].comment
     if isinstance(value, float) and not math.isfinite(value):
@@ -365,16 +299,7 @@ def set_keyword(header: fits.Header, name: str, value: Any) -> None:
 
 
 def fits_unit(unit: u.UnitBase) -> str:
-    """A unit for BUNIT, as JWST's pipeline spells its own.
-
-    Examples
-    --------
-    >>> from astropy import units as u
-    >>> fits_unit(u.Unit("MJy sr-1"))
-    'MJy/sr'
-    >>> fits_unit(u.adu / u.s)
-    'adu s-1'
-    """
+    """A unit for BUNIT: "MJy/sr" as JWST's pipeline spells its own, "adu s-1" as FITS does."""
     if unit == _PIPELINE:
         return "MJy/sr"
     try:

@@ -16,22 +16,10 @@ _MOST_ROWS = 20
 def html_summary(
     title: str, facts: Mapping[str, Any], table: Table | None = None, columns: Iterable[str] = ()
 ) -> str:
-    """Summary of an object as HTML, for its method ``_repr_html_``.
+    """Summary of an object as HTML, for ``_repr_html_``; facts that are None are left out.
 
-    Parameters
-    ----------
-    title : str
-    facts : mapping
-        Values by their names; None is left out.
-    table : Table, optional
-        Shown below the facts, at most 20 rows of it.
-    columns : iterable of str
-        Columns of the table to show, as far as it has them.
-
-    Returns
-    -------
-    str
-        Everything that is not markup is escaped: headers of files may hold anything.
+    At most 20 rows of the table are shown, of the `columns` that it has. Everything that is not
+    markup is escaped: headers of files may hold anything.
     """
     lines = [f"<div><strong>{escape(title)}</strong>", "<table>"]
     lines += [

@@ -52,22 +52,14 @@ def duration(seconds: float) -> str:
 
 @dataclass
 class _Schedule:
-    """Stages and how long they take, compared with what was expected.
+    """Stages and how long they take, compared with what was expected."""
 
-    Attributes
-    ----------
-    expected : dict of str to float
-        Durations of the stages that have not begun, s, by name.
-    count : int
-        Number of stages that have begun.
-    """
-
-    expected: dict[str, float]
-    count: int = 0
-    _own: float = 0.0
+    expected: dict[str, float]  # s, of stages that have not begun, by name
+    count: int = 0  # of stages that have begun
+    _own: float = 0.0  # expected duration of the present stage, s
     _began: float = field(default_factory=time.monotonic)
-    _done: float = 0.0
-    _spent: float = 0.0
+    _done: float = 0.0  # expected duration of the stages that have ended, s
+    _spent: float = 0.0  # what these have taken, s
     _part: float = 0.0
     _part_spent: float = 0.0
 
@@ -94,11 +86,14 @@ class _Schedule:
         """Time that this stage and the next ones take, as far as they were expected."""
         if not (self._own or self.expected):
             return ""
+        # `pace` is the time that things take over the time that was expected.
         spent, later = time.monotonic() - self._began, sum(self.expected.values())
         pace = self._spent / self._done if self._done else 1.0
         if self._part > 0:
             # By the speed of what is done of this stage, which is a large one.
             pace = self._part_spent / (self._own * self._part) if self._own else pace
+            # What was expected of the rest, at that pace, less what has passed since the part was
+            # noted.
             rest = (self._own * (1 - self._part) + later) * pace - (spent - self._part_spent)
             return f", about {duration(max(rest, later * pace))} left"
         if spent <= self._own * pace:
@@ -114,11 +109,8 @@ class _Schedule:
 def numbered_stages(expected: Mapping[str, float] | None = None) -> Iterator[None]:
     """Number the stages inside from 1, unless they are part of stages that are numbered.
 
-    Parameters
-    ----------
-    expected : mapping of str to float, optional
-        Durations of the stages, s, by name. With it, messages say how much time is left, by the
-        speed of the stages that have ended.
+    With `expected` durations of stages (s, by name), messages say how much time is left, by the
+    speed of the stages that have ended.
     """
     token = None
     if _SCHEDULE.get() is None:
@@ -192,14 +184,9 @@ def stage(name: str) -> Iterator[None]:
 class ProgressBar:
     """A progress bar that also writes a line to the log now and then, at most one a minute.
 
-    Parameters
-    ----------
-    name : str
-        Name of the loop. Inside a `stage` the name of the stage is shown instead.
-    total : int, optional
-        Number of steps; None for a loop that ends when it has converged.
-    shown : bool
-        Show the bar on standard error. A bar inside another one is not shown, nor logged.
+    Inside a `stage` the name of the stage is shown in place of `name`. It is on standard error if
+    `shown`. `total` is None for a loop that ends when it has converged. A bar inside another one is
+    not shown, nor logged.
     """
 
     def __init__(self, name: str, total: int | None = None, *, shown: bool) -> None:

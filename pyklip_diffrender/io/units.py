@@ -52,45 +52,20 @@ Angle = TypeVar("Angle", float, NDArray[np.float64])
 
 
 def full_circle(degrees: Angle) -> Angle:
-    """Return an angle from 0 to 360 degrees, the range of all position angles.
-
-    Examples
-    --------
-    >>> full_circle(-54.0)
-    306.0
-    """
+    """Return an angle from 0 to 360 degrees, the range of all position angles."""
     # Twice, because rounding makes 360 of a tiny negative angle.
     return degrees % 360 % 360
 
 
 def half_circle(degrees: Angle) -> Angle:
-    """Return the difference of two angles, from -180 to 180 degrees.
-
-    Examples
-    --------
-    >>> half_circle(0.5 - 359.5)
-    1.0
-    """
+    """Return the difference of two angles, from -180 to 180 degrees: that of 0.5 and 359.5 is 1."""
     return (degrees + 180) % 360 - 180
 
 
 def rotation_matrix(degrees: float) -> NDArray[np.float64]:
-    """Return the matrix that rotates positions (x, y) counter-clockwise, from +x to +y.
+    """Return the matrix (2, 2) that rotates positions (x, y) counter-clockwise, from +x to +y.
 
-    Parameters
-    ----------
-    degrees : float
-
-    Returns
-    -------
-    ndarray, (2, 2)
-        To be multiplied by positions as columns from the left; rows take its transpose from
-        the right.
-
-    Examples
-    --------
-    >>> rotation_matrix(90).round(12) @ [1, 0]
-    array([0., 1.])
+    It is multiplied by positions as columns from the left; rows take its transpose from the right.
     """
     cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[cosine, -sine], [sine, cosine]])
@@ -207,12 +182,9 @@ def _converted(
 
 
 def to_mask(value: Any, name: str) -> NDArray[np.bool_]:
-    """Copy of an array of logical values, which are False where they are masked.
+    """Copy of logical values, or of 0 and 1, which are False where they are masked.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For something else than logical values, or the numbers 0 and 1.
+    IncompatibleSetupError for something else.
     """
     values, unit = _without_unit(value, name)
     known = np.nan_to_num(values, nan=0.0)
@@ -234,14 +206,9 @@ def to_arcsec(value: Any, name: str) -> NDArray[np.float64]:
 def to_unit(value: Any, unit: str | u.UnitBase, name: str) -> NDArray[np.float64]:
     """Convert anything with a unit, or a sequence of it, to a unit; bare numbers already have it.
 
-    `name` is the name of the value in messages. Values that are masked are NaN.
-
-    Raises
-    ------
-    UnitError
-        If the unit does not convert, or only some values have one.
-    IncompatibleSetupError
-        For complex numbers, dates, and uncertainties that are no standard deviations.
+    `name` is the name of the value in messages. Values that are masked are NaN. UnitError if the
+    unit does not convert, or only some values have one; IncompatibleSetupError for complex numbers,
+    dates, and uncertainties that are no standard deviations.
     """
     values, own = _without_unit(value, name)
     return values if own is None else _converted(values, own, u.Unit(unit), name)
@@ -250,14 +217,8 @@ def to_unit(value: Any, unit: str | u.UnitBase, name: str) -> NDArray[np.float64
 def to_number(value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any") -> float:
     """Convert a single number or Quantity to a unit; bare numbers already have it.
 
-    Raises
-    ------
-    UnitError
-        If the unit does not convert.
-    ShapeError
-        For an array, or something that is no number.
-    NonFiniteError, IncompatibleSetupError
-        For a number that is not finite, or out of bounds.
+    UnitError if the unit does not convert, ShapeError for an array or something that is no number,
+    and see `require_bound`.
     """
     try:
         array = to_unit(value, unit, name)
@@ -273,14 +234,9 @@ def to_number(value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any
 
 
 def to_bytes(value: Any, name: str) -> float:
-    """Convert text such as "2 GB", a Quantity or a number of bytes to bytes.
+    """Convert text such as "2 GB", a Quantity or a positive number of bytes to bytes.
 
-    Raises
-    ------
-    UnitError
-        For text that is not a number with a unit of memory, or another unit.
-    ShapeError, NonFiniteError, IncompatibleSetupError
-        See `to_number`; 0 is out of bounds.
+    UnitError for text that is not a number with a unit of memory; otherwise see `to_number`.
     """
     if isinstance(value, str):
         try:
@@ -293,13 +249,7 @@ def to_bytes(value: Any, name: str) -> float:
 def to_pair(
     value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any"
 ) -> tuple[float, float]:
-    """Convert two numbers or Quantities, or one that stands for both, to a unit.
-
-    Raises
-    ------
-    UnitError, ShapeError, NonFiniteError, IncompatibleSetupError
-        As `to_number`.
-    """
+    """Convert two numbers or Quantities, or one for both, to a unit; see `to_number`."""
     array = to_unit(value, unit, name)
     if array.size not in (1, 2):
         raise ShapeError(f"{name}: got shape {array.shape}, expected one number or two")
@@ -311,12 +261,7 @@ def to_pair(
 def require_bound(
     number: float, name: str, bound: Bound, unit: str | u.UnitBase = u.dimensionless_unscaled
 ) -> None:
-    """Check that a number is finite and within its bound.
-
-    Raises
-    ------
-    NonFiniteError, IncompatibleSetupError
-    """
+    """Raise NonFiniteError, or IncompatibleSetupError for a finite number out of its bound."""
     if not np.isfinite(number):
         raise NonFiniteError(f"{name}: got {number}, expected a finite number")
     if (bound == "positive" and not number > 0) or (bound == "not negative" and number < 0):
@@ -365,15 +310,8 @@ def require_finite(array: NDArray[Any], name: str, where: NDArray[np.bool_] | No
 def warn_of_rms(rms: float, name: str, stacklevel: int, *, small: bool = True) -> None:
     """Warn of a wavefront rms (m) that suggests another unit.
 
-    Parameters
-    ----------
-    rms : float
-    name : str
-        Name of the wavefront in the message.
-    stacklevel : int
-        As in `warnings.warn`, counted from this function.
-    small : bool
-        Also warn of an rms that is too small, but not of 0.
+    `stacklevel` is counted from this function; `small` also warns of an rms that is too small, but
+    not of 0.
     """
     low, high = _PLAUSIBLE_RMS
     if rms == 0 or (low if small else 0.0) < rms < high:

@@ -14,15 +14,7 @@ __all__ = ["Bandpass"]
 
 @dataclass(frozen=True)
 class Bandpass:
-    """A set of wavelengths with weights that sum to 1.
-
-    Attributes
-    ----------
-    wavelengths : tuple of float
-        m.
-    weights : tuple of float
-        Fraction of the detected photons at each wavelength.
-    """
+    """A set of wavelengths (m) with weights, fractions of the detected photons that sum to 1."""
 
     wavelengths: tuple[float, ...]
     weights: tuple[float, ...]
@@ -42,22 +34,7 @@ class Bandpass:
         object.__setattr__(self, "weights", tuple(w / total for w in self.weights))
 
     def thinned(self, count: int) -> tuple[tuple[int, ...], Bandpass]:
-        """Keep some of the wavelengths, evenly spread, and redistribute the weights of the others.
-
-        The weight of an omitted wavelength goes to its two neighbours as in linear interpolation,
-        which preserves integrals of functions that are linear between them.
-
-        Parameters
-        ----------
-        count : int
-            Number to keep.
-
-        Returns
-        -------
-        indices : tuple of int
-            Indices of the wavelengths kept.
-        bandpass : Bandpass
-        """
+        """Keep `count` wavelengths, evenly spread, with all weights: indices, and a bandpass."""
         total = len(self.wavelengths)
         if count >= total:
             return tuple(range(total)), self
@@ -68,6 +45,8 @@ class Bandpass:
         indices = np.sort(order[np.round(np.linspace(0, total - 1, count)).astype(int)])
         nodes = np.array(self.wavelengths)[indices]
         ascending = np.argsort(nodes)
+        # The weight of an omitted wavelength goes to its two neighbours as in linear interpolation,
+        # which preserves integrals of functions that are linear between them.
         shares = [
             np.interp(self.wavelengths, nodes[ascending], unit[ascending]) for unit in np.eye(count)
         ]
@@ -75,31 +54,25 @@ class Bandpass:
         return tuple(indices.tolist()), Bandpass(tuple(nodes.tolist()), tuple(weights.tolist()))
 
     def condensed(self, count: int) -> Bandpass:
-        """Replace the wavelengths by the nodes of a Gauss quadrature.
+        """Replace the wavelengths by the `count` nodes of a Gauss quadrature.
 
         Sums of polynomials in the wavelength up to the order 2 count - 1 stay the same. Broad-band
         images of a point source are ten times as accurate as with `thinned`, at wavelengths that
         are not among those of the bandpass.
-
-        Parameters
-        ----------
-        count : int
-            Number of nodes.
-
-        Returns
-        -------
-        Bandpass
-
-        References
-        ----------
-        G. H. Golub and J. H. Welsch, "Calculation of Gauss quadrature rules", Math. Comp. 23, 221
-        (1969)
         """
         if count >= len(self.wavelengths):
             return self
         weights, wavelengths = np.array(self.weights), np.array(self.wavelengths)
         scale = math.sqrt(weights @ (wavelengths - self.mean_wavelength) ** 2)
         x = (wavelengths - self.mean_wavelength) / scale
+        # G. H. Golub and J. H. Welsch, "Calculation of Gauss quadrature rules", Math. Comp. 23, 221
+        # (1969). With <f> = sum of w f(x) and norm_k = <p_k^2>, the recurrence is
+        #
+        #     p_k+1 = (x - a_k) p_k - b_k^2 p_k-1,
+        #     a_k = <x p_k^2> / norm_k,   b_k^2 = norm_k / norm_k-1.
+        #
+        # Nodes are the eigenvalues of the symmetric matrix with a_k on the diagonal and b_k beside
+        # it, weights the squared first components of its eigenvectors.
         # Recurrence of the polynomials that are orthogonal under these weights.
         matrix = np.zeros((count, count))
         before, polynomial, norm = np.zeros_like(x), np.ones_like(x), 1.0

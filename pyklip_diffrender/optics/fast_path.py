@@ -100,30 +100,14 @@ right where the others may be wrapped."""
 
 @dataclass(frozen=True)
 class _Axis:
-    """Cells and samples along one axis.
+    """Cells and samples along one axis."""
 
-    Attributes
-    ----------
-    samples : int
-        Number of detector samples.
-    phases : int
-        Samples per cell, where samples are finer; each has its own kernel.
-    cells : int
-        Cells per sample, where cells are finer.
-    half : int
-        Cells are numbered from -half to half.
-    spacing : float
-        Distance between cells, radians.
-    wrapped : bool
-        Whether the largest differences may be wrapped.
-    """
-
-    samples: int
-    phases: int
-    cells: int
-    half: int
-    spacing: float
-    wrapped: bool
+    samples: int  # of the detector
+    phases: int  # samples per cell, where samples are finer; each has its own kernel
+    cells: int  # cells per sample, where cells are finer
+    half: int  # cells are numbered from -half to half
+    spacing: float  # between cells, radians
+    wrapped: bool  # whether the largest differences may be wrapped
 
     @classmethod
     def fit(
@@ -161,6 +145,8 @@ class _Axis:
     @property
     def period(self) -> int:
         """Period of the convolution, in steps between samples of one phase."""
+        # There are (count - 1) cells + 2 half + 1 differences x - c. If they may be wrapped, only
+        # those from the middle cells have to be different.
         cells = math.ceil(_UNWRAPPED * 2 * self.half) if self.wrapped else 2 * self.half
         needed = (self.count - 1) * self.cells + cells + 1
         return int(next_fast_len(math.ceil(needed / self.cells)))
@@ -187,6 +173,9 @@ class _Axis:
         fine = torch.arange(-inside * _FINER, inside * _FINER + 1, dtype=torch.float64) / _FINER
         cells = torch.arange(-self.half, self.half + 1, dtype=torch.float64)
         distance = cells[:, None] - fine
+        # sinc passes the frequencies below half a cycle per cell. The transform of the window is
+        # proportional to exp(-(f / _ROLL_OFF)^2): it rounds the edge of the band, and the sum
+        # converges.
         window = torch.exp(-((math.pi * _ROLL_OFF * distance) ** 2))
         return torch.sinc(distance) * window / _FINER
 
@@ -216,39 +205,14 @@ def _axes(
 def finest_spacing(
     occulter: CompactOcculter, detector: Detector, wavelength: float, sampling: float
 ) -> float:
-    """Return the smaller spacing of the aligned cells, radians.
-
-    Parameters
-    ----------
-    occulter : CompactOcculter
-    detector : Detector
-    wavelength : float
-        m.
-    sampling : float
-        Smallest number of cells per lambda/D.
-    """
+    """Return the smaller spacing of the aligned cells (radians), `sampling` or more a lambda/D."""
     return min(axis.spacing for axis in _axes(occulter, detector, wavelength, sampling))
 
 
 class OcculterLattice:
-    """The cells of an occulter at one wavelength, and the convolution from them to the detector.
+    """The cells of an occulter at one wavelength (m), and their convolution to the detector.
 
-    Parameters
-    ----------
-    occulter : CompactOcculter
-    detector : Detector
-    wavelength : float
-        m.
-    sampling : float
-        Smallest number of cells per lambda/D.
-    wrapped : bool
-        Whether the largest differences may be wrapped, see the top of this module.
-
-    Attributes
-    ----------
-    x, y : _Axis
-    blocked : Tensor, (cells in y, cells in x)
-        1 - t on the cells, times the factor that turns the sum into the field on a sample.
+    `sampling` is the smallest number of cells per lambda/D; `wrapped` is explained above.
     """
 
     def __init__(
@@ -267,6 +231,8 @@ class OcculterLattice:
             for axis in (self.x, self.y)
             for n in [(axis.half - _MARGIN) * _FINER]
         )
+        # 1 - t on the cells, (cells in y, cells in x), times the factor that turns the sum over
+        # cells into the field on a sample.
         mask = occulter.complement(x[None, :], y[:, None] + self.shear * x[None, :])
         mask = self.y.band_limiting() @ mask @ self.x.band_limiting().T
         scale = self.x.spacing * self.y.spacing / wavelength * detector.per_sample
@@ -293,18 +259,16 @@ class OcculterLattice:
 
         The light is `focus` times `blocked` per sample of the detector.
         """
+        # The light has the factor cell / lambda of the inverse transform already: `cell` is set to
+        # lambda.
         transform = self._transform(wavefront, self.x.positions, self.y.positions)
         return transform.inverse(light, self.wavelength)
 
     def kernel(self, stop: Wavefront, axes: Sequence[Tensor]) -> Tensor:
         """Transform of the kernel of the convolution, (phases in y, phases in x, n, m).
 
-        Parameters
-        ----------
-        stop : Wavefront
-            The product of all planes behind the occulter.
-        axes : two Tensor
-            Sample positions x, y, radians.
+        `stop` is the product of all planes behind the occulter, `axes` the sample positions x, y,
+        radians.
         """
         size = [axis.period * axis.cells for axis in (self.y, self.x)]
         rows = []
@@ -321,18 +285,10 @@ class OcculterLattice:
         return torch.fft.fft2(kernels) / (self.x.cells * self.y.cells)
 
     def convolve(self, light: Tensor, kernel: Tensor) -> Tensor:
-        """Field on the detector's samples of the light that the mask removes on the cells.
+        """Field on the samples, (..., samples in y and x), of the light that the mask removes.
 
-        Parameters
-        ----------
-        light : Tensor, (..., cells in y, cells in x)
-            ``focus`` times ``blocked``.
-        kernel : Tensor
-            See `kernel`.
-
-        Returns
-        -------
-        Tensor, (..., samples in y, samples in x)
+        The light is ``focus`` times ``blocked``, (..., cells in y, cells in x), the kernel
+        `kernel`'s.
         """
         x, y = self.x, self.y
         spectrum = torch.fft.fft2(light, s=(y.cells * y.period, x.cells * x.period))
@@ -365,17 +321,9 @@ class OcculterLattice:
 
 
 class ShiftedTransforms:
-    """Fourier transforms of a field times plane waves.
+    """Fourier transforms of a field times plane waves, of up to `reach` cycles along an axis.
 
-    Parameters
-    ----------
-    wavefront : Wavefront
-    x, y : Tensor
-        Image positions, radians, float64, those along y symmetric about 0.
-    shear : float
-        See `MatrixFourier`.
-    reach : int
-        Largest number of cycles along an axis.
+    `x` and `y` are image positions in radians, float64, those along y symmetric about 0.
     """
 
     def __init__(
@@ -407,18 +355,10 @@ class ShiftedTransforms:
         )
 
     def at(self, fx: int, fy: slice) -> Tensor:
-        """Transforms for waves of fx and -fx whole cycles along x, and fy and -fy along y.
+        """Transforms for waves of +-fx whole cycles along x and +-fy along y, (2, 2, waves, y, x).
 
-        Parameters
-        ----------
-        fx : int
-        fy : slice
-            Of the numbers 0 to `reach`.
-
-        Returns
-        -------
-        Tensor, (2, 2, waves, y, x)
-            Per radian; the first axis is the sign of fx, the second that of fy.
+        `fy` is a slice of the numbers 0 to `reach`. Per radian; the first axis is the sign of fx,
+        the second that of fy.
         """
         cosine, sine = self._cosine[fy].flatten(0, 1), self._sine[fy].flatten(0, 1)
         shape = (-1, self._cosine.shape[1], self._even.shape[-1] // 2, 2)
@@ -448,27 +388,13 @@ def _fold(field: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class PlaneWaves:
-    """Fields on the detector of a field in the entrance pupil times plane waves.
+    """Fields on the detector of a field in the entrance pupil times plane waves."""
 
-    Attributes
-    ----------
-    direct : ShiftedTransforms
-        From the pupil to the detector, without the occulter.
-    focus : ShiftedTransforms
-        To the cells of the occulter.
-    blocked : Tensor
-        See `OcculterLattice`.
-    per_sample : float
-        See `Detector`.
-    onwards : callable
-        From the light on the cells to the detector.
-    """
-
-    direct: ShiftedTransforms
-    focus: ShiftedTransforms
-    blocked: Tensor
+    direct: ShiftedTransforms  # from the pupil to the detector, without the occulter
+    focus: ShiftedTransforms  # to the cells of the occulter
+    blocked: Tensor  # see `OcculterLattice`
     per_sample: float
-    onwards: Callable[[Tensor], Tensor]
+    onwards: Callable[[Tensor], Tensor]  # from the light on the cells to the detector
 
     def fields(self, fx: int, fy: slice) -> Tensor:
         """Fields for waves exp(2 pi i (+-fx xi +- fy eta) / D), (2, 2, waves, ny, nx).
@@ -485,14 +411,7 @@ class PlaneWaves:
 
 
 class LatticeRoute:
-    """Propagation through planes with one compact occulter by `OcculterLattice`.
-
-    Parameters
-    ----------
-    planes : sequence of Plane
-        See `serves`.
-    detector : Detector
-    """
+    """Propagation through planes with one compact occulter (see `serves`) by `OcculterLattice`."""
 
     def __init__(self, planes: Sequence[Plane], detector: Detector) -> None:
         self.planes, self.detector = tuple(planes), detector
@@ -563,6 +482,8 @@ class LatticeRoute:
             stop = plane.apply(stop, values, window)
         if "detector_shift" not in values:
             return stop
+        # A detector moved by d has its samples at x - d. F[L E](x - d) is the transform of L E
+        # times the tilt of a source at d, and so is that of the kernel F[L].
         x, y = values["detector_shift"].unbind(-1)
         shift = torch.stack([x, y + self.detector.shear * x], dim=-1) * ARCSEC
         factors = [
@@ -582,12 +503,7 @@ class LatticeRoute:
     def field(self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]) -> Tensor:
         """Propagate from the entrance pupil to the detector's samples.
 
-        Parameters
-        ----------
-        wavefront : Wavefront
-        values : mapping of str to Tensor
-        onto : sequence of PupilGrid
-            For every plane, the window to pass on (`OpticalSystem.windows`).
+        `onto` has for every plane the window to pass on (`OpticalSystem.windows`).
         """
         for plane, window in zip(self.planes[: self._place], onto, strict=False):
             wavefront = plane.apply(wavefront, values, window)

@@ -41,21 +41,11 @@ STAR_RADIUS = 2.0
 
 @dataclass(frozen=True)
 class PupilGrid:
-    """A rectangular window of an ``npix`` x ``npix`` pupil array of side ``diameter``.
-
-    Attributes
-    ----------
-    npix : int
-        Samples across the full array.
-    diameter : float
-        Side of the full array, m.
-    rows, columns : tuple of int
-        Half-open index ranges [start, stop) of the window.
-    """
+    """A rectangular window of an ``npix`` x ``npix`` pupil array of side ``diameter``."""
 
     npix: int
-    diameter: float
-    rows: tuple[int, int]
+    diameter: float  # m, side of the full array
+    rows: tuple[int, int]  # [start, stop) of the window
     columns: tuple[int, int]
 
     @classmethod
@@ -115,14 +105,7 @@ class PupilGrid:
         return replace(self, rows=(starts[0], stops[0]), columns=(starts[1], stops[1]))
 
     def crop(self, array: Tensor, to: PupilGrid) -> Tensor:
-        """Cut the window `to` out of an array on this window, with zeros outside.
-
-        Parameters
-        ----------
-        array : Tensor, (..., rows, columns)
-        to : PupilGrid
-            A window of the same full array.
-        """
+        """Cut the window `to` out of an array (..., rows, columns) on this; zero outside."""
         if to == self:
             return array
         top, bottom = to.rows[0] - self.rows[0], self.rows[1] - to.rows[1]
@@ -136,39 +119,18 @@ class PupilGrid:
 
 
 def samples_for_field(field: float, wavelength: float, diameter: float = JWST_DIAMETER) -> int:
-    """Smallest number of pupil samples for which the image does not repeat inside a field.
+    """Smallest number of pupil samples for which the image does not repeat inside `field` arcsec.
 
-    Parameters
-    ----------
-    field : float
-        Width, arcsec.
-    wavelength, diameter : float
-        m; the shortest wavelength, and the side of the pupil array.
+    `wavelength` (m) is the shortest one, `diameter` (m) the side of the pupil array.
     """
     return math.ceil(field * ARCSEC * diameter / wavelength)
 
 
 def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
-    """Resample square pupil maps to another number of pixels across the same pupil.
+    """Resample pupil maps (..., n, n) to (..., npix, npix), float64, across the same pupil.
 
-    Blocks are averaged where the numbers of pixels divide; otherwise the map is interpolated
-    bilinearly, after smoothing if the new pixels are larger. A map that already has the right size
-    is returned without a copy.
-
-    Parameters
-    ----------
-    opd : ndarray, (..., n, n)
-        Real values.
-    npix : int
-
-    Returns
-    -------
-    ndarray, (..., npix, npix), float64
-
-    Raises
-    ------
-    ShapeError
-        If the maps are not square.
+    A map that already has the right size is returned without a copy. ShapeError if the maps are not
+    square.
     """
     if opd.ndim < 2 or opd.shape[-1] != opd.shape[-2] or not opd.size:
         raise ShapeError(
@@ -179,6 +141,9 @@ def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
     if npix == count:
         return opd
     maps = torch.from_numpy(native_float64(opd)).reshape(-1, 1, count, count)
+    # Blocks are averaged where the numbers of pixels divide, which keeps the mean exactly;
+    # otherwise maps are interpolated, and smoothed before (`antialias`) if the new pixels are
+    # larger.
     if count % npix == 0:
         maps = torch.nn.functional.avg_pool2d(maps, count // npix)
     else:
@@ -189,41 +154,29 @@ def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
 
 
 def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
-    """Fraction of each pixel's area that lies inside non-overlapping polygons.
+    """Fraction of each pixel's area inside non-overlapping polygons, (rows, columns), float64.
 
-    The area is exact, whatever the grid, and differentiable in the vertices; see the notes.
-
-    Parameters
-    ----------
-    polygons : list of Tensor, each (vertices, 2)
-        x, y of the vertices in m, in either sense of rotation, not self-intersecting.
-    grid : PupilGrid
-
-    Returns
-    -------
-    Tensor, (rows, columns), float64
-        Between 0 and 1.
-
-    Notes
-    -----
-    In units of pixels, let C(i, j) be the covered area of the pixel in row i, column j. By Green's
-    theorem the area of a polygon is the integral of x dy along its edges, and so is that of its
-    part to the left of any vertical line, with x cut off there. All edges are cut at the borders
-    of pixels (`_border_crossings`). A piece in pixel (i, j), from y1 to y2 with its middle at
-    x = j + f, is straight, so that of the strip between it and the right end of row i it bounds
-
-        (y1 - y2) (1 - f)   in the pixel (i, j) itself, a trapezium,
-        (y1 - y2)           in every pixel (i, j + 1), (i, j + 2), ... to its right,
-
-    for edges that run counter-clockwise. Summed over the pieces, areas outside the polygon
-    cancel. The second line needs no loop: each piece adds
-
-        D(i, j) += (y1 - y2) (1 - f),    D(i, j + 1) += (y1 - y2) f,
-
-    and C(i, j) = D(i, 0) + ... + D(i, j), a cumulative sum (the accumulation buffer of font
-    rasterisers). The derivative with respect to the vertices is that of the pieces' ends; the
-    integers i, j are constant except where a vertex crosses a border, where C is continuous.
+    Each polygon is (vertices, 2), x, y in m, in either sense of rotation and not self-intersecting.
+    The area is exact, whatever the grid, and differentiable in the vertices.
     """
+    # In units of pixels, let C(i, j) be the covered area of the pixel in row i, column j. By
+    # Green's theorem the area of a polygon is the integral of x dy along its edges, and so is that
+    # of its part to the left of any vertical line, with x cut off there. All edges are cut at the
+    # borders of pixels (`_border_crossings`). A piece in pixel (i, j), from y1 to y2 with its
+    # middle at x = j + f, is straight, so that of the strip between it and the right end of row i
+    # it bounds
+    #
+    #     (y1 - y2) (1 - f)   in the pixel (i, j) itself, a trapezium,
+    #     (y1 - y2)           in every pixel (i, j + 1), (i, j + 2), ... to its right,
+    #
+    # for edges that run counter-clockwise. Summed over the pieces, areas outside the polygon
+    # cancel. The second line needs no loop: each piece adds
+    #
+    #     D(i, j) += (y1 - y2) (1 - f),    D(i, j + 1) += (y1 - y2) f,
+    #
+    # and C(i, j) = D(i, 0) + ... + D(i, j), a cumulative sum (the accumulation buffer of font
+    # rasterisers). The derivative with respect to the vertices is that of the pieces' ends; the
+    # integers i, j are constant except where a vertex crosses a border, where C is continuous.
     rows, columns = grid.shape
     origin = torch.tensor([grid.columns[0], grid.rows[0]], dtype=torch.float64)
     # All polygons at once: the time goes to the number of operations, above all in derivatives.
@@ -263,19 +216,17 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
 
 
 def _border_crossings(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-    """Crossings of edges with integer x or y, as fractions of the edge, and the start of each edge.
+    """Cut edges (n, 2) at integer x and y: the edge of each piece, and its start.
 
-    Returns
-    -------
-    edge : Tensor, (pieces,), int64
-        Index of the edge of each piece, ascending.
-    fraction : Tensor, (pieces + 1,)
-        Start of each piece on its edge, ascending within an edge, and one spare element.
+    Edges are (pieces,), int64, ascending; starts are (pieces + 1,), fractions of the edge,
+    ascending within an edge, with one spare element.
     """
     edges = [torch.arange(len(start))]
     fractions = [torch.zeros(len(start), dtype=torch.float64)]
     for axis in (0, 1):
         a, b = start[:, axis], end[:, axis]
+        # The edge from a to b crosses the integers strictly between them, `first` to `after` - 1.
+        # It crosses k at the fraction (k - a) / (b - a).
         first = torch.floor(torch.minimum(a, b).detach()).to(torch.int64) + 1
         after = torch.ceil(torch.maximum(a, b).detach()).to(torch.int64)
         count = (after - first).clamp(min=0)
@@ -290,16 +241,9 @@ def _border_crossings(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def transform_polygons(polygons: list[Tensor], shift: Tensor, rotation: Tensor) -> list[Tensor]:
-    """Turn polygons about the pupil's centre, then shift them.
+    """Turn polygons (vertices, 2) by `rotation` about the pupil's centre, then add `shift`.
 
-    Parameters
-    ----------
-    polygons : list of Tensor, each (vertices, 2)
-        m.
-    shift : Tensor, (2,)
-        x, y in m.
-    rotation : Tensor, ()
-        Radians, counter-clockwise (from +x to +y).
+    Vertices and `shift` (2,) are x, y in m; the angle is in radians, counter-clockwise (+x to +y).
     """
     cosine, sine = torch.cos(rotation), torch.sin(rotation)
     matrix = torch.stack([torch.stack([cosine, sine]), torch.stack([-sine, cosine])])
@@ -335,20 +279,9 @@ def noll_indices(j: int) -> tuple[int, int]:
 
 
 def zernike_basis(count: int, x: Tensor, y: Tensor, radius: float) -> Tensor:
-    """Sample the first `count` Noll Zernikes on a rectangular grid; zero outside the disc.
+    """The first `count` Noll Zernikes on a grid, (count, rows, columns); zero outside the disc.
 
-    Parameters
-    ----------
-    count : int
-        Number of polynomials, from Noll index 1 (piston).
-    x, y : Tensor, (columns,), (rows,)
-        Positions, m.
-    radius : float
-        Radius of the disc, m.
-
-    Returns
-    -------
-    Tensor, (count, rows, columns)
+    `x` is (columns,), `y` (rows,), `radius` that of the disc, all in m. The first is piston.
     """
     # rho^m exp(i m theta) is a power of x + i y: no trigonometry, and smooth at the centre.
     point = torch.complex(*torch.broadcast_tensors(x[None, :] / radius, y[:, None] / radius))
@@ -364,6 +297,9 @@ def zernike_basis(count: int, x: Tensor, y: Tensor, radius: float) -> Tensor:
     for j in range(1, count + 1):
         n, m = noll_indices(j)
         half = (n - abs(m)) // 2
+        # R_n^m(rho) = sum_k (-1)^k C(n - k, k) C(n - 2k, (n - m) / 2 - k) rho^(n - 2k). Here it is
+        # without its factor rho^m, which `waves` has. sqrt(n + 1), and sqrt(2 (n + 1)) for m > 0,
+        # make the rms on the disc 1.
         radial = sum(
             (-1) ** k * comb(n - k, k) * comb(n - 2 * k, half - k) * even[half - k]
             for k in range(half + 1)

@@ -18,7 +18,7 @@ so that the adjoint of E0 -> Ed is
 g -> (1 - F^-1 (1 - t) F) L exp(-2 pi i W / lambda) F^-1 g.
 
 With S = L exp(2 pi i W / lambda), the last four lines are one, Ed = F[S E0] - F[S] * (1 - t) F[E0],
-where * is a convolution of small arrays: `optics.fast` computes that.
+where * is a convolution of small arrays: `optics.fast_path` computes that.
 
 A plane maps one `Wavefront` to the next. Values of free parameters are passed by name; a plane uses
 those that it declares in `parameters`.
@@ -145,17 +145,8 @@ def cached(
 ) -> Made:
     """The stored result for a key if it was made at the same position, else a new one.
 
-    Only the latest result for each key is stored. Nothing is stored while differentiating
-    (position None), nor within a transform of `torch.func`, see `Cache`.
-
-    Parameters
-    ----------
-    store : Cache
-    key : hashable
-    position : Position or None
-        See `position_of`.
-    make : callable
-        Makes a new result.
+    Only the latest result for each key is stored. Nothing is stored while differentiating (position
+    None, see `position_of`), nor within a transform of `torch.func`, see `Cache`.
     """
     if position is None:
         return make()
@@ -194,18 +185,8 @@ def kernel(image: Tensor, pupil: Tensor, wavelength: float, sign: int) -> Tensor
 def tilt_phases(offset: Tensor, grid: PupilGrid, wavelength: float) -> tuple[Tensor, Tensor]:
     """Pupil phase of a source off the axis, as a sum of a function of x and one of y.
 
-    Parameters
-    ----------
-    offset : Tensor, (..., 2)
-        x, y of the source on the image, radians.
-    grid : PupilGrid
-    wavelength : float
-        m.
-
-    Returns
-    -------
-    Tensor, (..., columns) and (..., rows)
-        Radians, each within half a turn.
+    `offset` is (..., 2), x, y of the source on the image in radians; the phases are (..., columns)
+    and (..., rows), in radians, each within half a turn.
     """
     x_turns = -offset[..., 0:1] * grid.x.to(offset.device) / wavelength
     y_turns = offset[..., 1:2] * grid.y.to(offset.device) / wavelength
@@ -215,22 +196,9 @@ def tilt_phases(offset: Tensor, grid: PupilGrid, wavelength: float) -> tuple[Ten
 class MatrixFourier:
     """The Fourier transform between one pupil window and one set of image positions.
 
-    The matrices are built once, in double precision, and cast; forward and inverse are two
-    matrix products each (R. Soummer et al., "Fast computation of Lyot-style coronagraph
-    propagation", Opt. Express 15, 15935, 2007). The large product is the one along y.
-
-    Parameters
-    ----------
-    grid : PupilGrid
-        The pupil window.
-    x, y : Tensor, (columns,), (rows,), float64
-        Image positions, radians. They may require gradients.
-    wavelength : float
-        m.
-    dtype : torch.dtype
-        complex128 or complex64.
-    shear : float
-        Increase of y with x on the image: the true y of pixel (i, j) is ``y[i] + shear x[j]``.
+    `x` (columns,) and `y` (rows,) are image positions in radians, float64, and may require
+    gradients; `wavelength` is in m. With `shear`, the true y of pixel (i, j) is
+    ``y[i] + shear x[j]``.
     """
 
     def __init__(
@@ -242,6 +210,9 @@ class MatrixFourier:
         dtype: torch.dtype = torch.complex128,
         shear: float = 0.0,
     ) -> None:
+        # The matrices are built once, in double precision, and cast; forward and inverse are two
+        # matrix products each (R. Soummer et al., "Fast computation of Lyot-style coronagraph
+        # propagation", Opt. Express 15, 15935, 2007). The large product is the one along y.
         self.grid = grid
         pupil_x, pupil_y = grid.x.to(x.device), grid.y.to(x.device)
         self._columns = kernel(x, pupil_x, wavelength, +1).to(dtype).T.contiguous()
@@ -271,44 +242,25 @@ Values = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Wavefront:
-    """A monochromatic field on a window of the pupil.
+    """A monochromatic field on a window of the pupil."""
 
-    Attributes
-    ----------
-    field : Tensor, (..., rows, columns), complex
-        Square root of light per m^2; the whole pupil collects 1.
-    wavelength : float
-        m.
-    grid : PupilGrid
-        The window of the samples.
-    """
-
-    field: Tensor
-    wavelength: float
+    field: Tensor  # (..., rows, columns), square root of light per m^2; 1 in the whole pupil
+    wavelength: float  # m
     grid: PupilGrid
 
 
 class Plane(ABC):
-    """A plane of an `OpticalSystem` behind the entrance pupil; linear in the field.
-
-    Attributes
-    ----------
-    name : str
-    parameters : tuple of str
-        Names of the free parameters that it uses.
-    focal : bool
-        True for a mask in a focus, False for an optic in a pupil.
-    pointwise : bool
-        True if it multiplies each sample of the field in the pupil by a factor that does not
-        depend on the field, and that no gradient has to reach except by `parameters`.
-    sampled : bool
-        True if it is known only at the wavelengths that it was made for.
-    """
+    """A plane of an `OpticalSystem` behind the entrance pupil; linear in the field."""
 
     name: str
+    # Names of the free parameters that it uses.
     parameters: tuple[str, ...] = ()
+    # True for a mask in a focus, False for an optic in a pupil.
     focal: bool = False
+    # True if it multiplies each sample of the field in the pupil by a factor that does not depend
+    # on the field, and that no gradient has to reach except by `parameters`.
     pointwise: bool = False
+    # True if it is known only at the wavelengths that it was made for.
     sampled: bool = False
 
     def window(self, values: Values) -> PupilGrid | None:
@@ -335,14 +287,8 @@ def phase_factor(opd: Tensor, wavelength: float, dtype: torch.dtype) -> Tensor:
 class EntrancePupil:
     """The aperture where the wavefront enters: transmission, OPD and direction of the source.
 
-    Parameters
-    ----------
-    amplitude : Tensor, (npix, npix), float64
-        Amplitude transmission, entrance-pupil orientation.
-    diameter : float
-        Side of the array, m.
-    dtype : torch.dtype
-        Real type of the computation.
+    `amplitude` is the transmission, (npix, npix), float64, in entrance-pupil orientation,
+    `diameter` the side of the array in m, `dtype` the real type of the computation.
     """
 
     parameters: tuple[str, ...] = ("star_offset",)
@@ -360,6 +306,7 @@ class EntrancePupil:
         self.full = full
         self.grid = full.around(amplitude)
         self.total = float((amplitude**2).sum())
+        # The amplitude is scaled so that the pupil collects 1: sum of A^2 d_xi d_eta = 1.
         power = (amplitude**2).sum() * full.spacing**2
         self.amplitude = full.crop(amplitude / torch.sqrt(power), self.grid).to(dtype)
         self.lit = amplitude > 0
@@ -370,16 +317,10 @@ class EntrancePupil:
         return self.full.crop(maps, self.grid)
 
     def field(self, opd: Tensor, wavelength: float, star_offset: Tensor | None) -> Wavefront:
-        """The field behind the pupil.
+        """The field behind the pupil, for an OPD (..., npix, npix) in m and a wavelength in m.
 
-        Parameters
-        ----------
-        opd : Tensor, (..., npix, npix)
-            m. An imaginary part is absorption: the amplitude is exp(-2 pi Im / wavelength).
-        wavelength : float
-            m.
-        star_offset : Tensor, (..., 2), or None
-            arcsec, image orientation; None on the axis.
+        An imaginary part of the OPD is absorption: the amplitude is exp(-2 pi Im / wavelength).
+        `star_offset` is (..., 2) in arcsec, image orientation, or None on the axis.
         """
         opd = self.on_window(opd)
         wavenumber = 2 * math.pi / wavelength
@@ -399,17 +340,8 @@ class EntrancePupil:
 class LyotStop(Plane):
     """A stop made of polygonal openings that can be shifted and turned, exactly.
 
-    The openings are rasterised at every position (`polygon_coverage`), so that the image is a
-    smooth function of shift and rotation with the true derivative.
-
-    Parameters
-    ----------
-    openings : list of Tensor, each (vertices, 2)
-        Outlines in m at the primary, entrance-pupil orientation.
-    npix : int
-        Samples across the full pupil array.
-    diameter : float
-        Side of the full array, m; `lyot_shift` is a fraction of it.
+    The openings are outlines (vertices, 2) in m at the primary, entrance-pupil orientation;
+    `diameter` is the side of the pupil array in m, and `lyot_shift` a fraction of it.
     """
 
     parameters = ("lyot_shift", "lyot_rotation")
@@ -445,6 +377,8 @@ class LyotStop(Plane):
         return cached(self._latest, grid, position, lambda: self._coverage(values, grid))
 
     def _coverage(self, values: Values, grid: PupilGrid) -> Tensor:
+        # Rasterised anew at every position, so that the image is a smooth function of shift and
+        # rotation with the true derivative.
         zero = torch.zeros(2, dtype=torch.float64)
         shift = values.get("lyot_shift", zero).cpu() * self.diameter
         rotation = torch.deg2rad(values.get("lyot_rotation", zero[:1]).cpu()).reshape(())
@@ -460,12 +394,8 @@ class LyotStop(Plane):
 class InternalAberration(Plane):
     """Wavefront error of the instrument behind the Lyot stop, in Zernikes on the pupil's disc.
 
-    Parameters
-    ----------
-    coefficients : Tensor, (36,)
-        Noll order, m rms, entrance-pupil orientation.
-    chromatic : callable, optional
-        Wavelength (m) to additional coefficients {Noll index: m}.
+    `coefficients` is (36,), Noll order, m rms, entrance-pupil orientation; `chromatic` maps a
+    wavelength (m) to additional coefficients {Noll index: m}.
     """
 
     parameters = ("si_zernikes",)
@@ -520,18 +450,9 @@ class InternalAberration(Plane):
 class CompactOcculter(Plane):
     """A focal-plane mask whose complement 1 - t is zero outside a disc or a rectangle.
 
-    The field behind it, back in the pupil, is E - F^-1[(1 - t) F[E]]. Only the square about the
-    disc, or the rectangle, is ever sampled, in cells of ``1 / sampling`` of lambda/D.
-
-    Parameters
-    ----------
-    complement : callable
-        From angles (x, y) in arcsec to the amplitude 1 - t, computed directly in double precision
-        because 1 - t from t would lose digits by cancellation.
-    radius : float or (x, y)
-        arcsec; `complement` vanishes beyond. Two numbers are half the sides of a rectangle.
-    sampling : float, optional
-        Cells per lambda / `diameter`; default 4.
+    `complement` maps angles (x, y) in arcsec to the amplitude 1 - t, which vanishes beyond `radius`
+    (arcsec; two numbers are half the sides of a rectangle). The mask is sampled in `sampling`
+    cells, by default 4, per lambda / `diameter`.
     """
 
     focal = True
@@ -552,6 +473,9 @@ class CompactOcculter(Plane):
                 "(below that the cells alias the pupil onto itself; 2 to 4 is usual)"
             )
         self.name = name
+        # The field behind the mask, back in the pupil, is E - F^-1[(1 - t) F[E]], so that only the
+        # square about the disc, or the rectangle, is ever sampled. `complement` computes 1 - t
+        # directly in double precision: from t it would lose digits by cancellation.
         self.complement, self.sampling = complement, sampling
         self.reach = radius if isinstance(radius, tuple) else (radius, radius)
         self.radius = max(self.reach)
@@ -601,31 +525,18 @@ class CompactOcculter(Plane):
 
 @dataclass
 class Detector:
-    """The pixel array.
+    """The pixel array."""
 
-    Attributes
-    ----------
-    shape : tuple of int
-        (ny, nx) detector pixels.
-    pixelscale : tuple of float
-        (x, y) arcsec per pixel.
-    oversample : int
-        Samples per pixel along each axis; a pixel's value is the mean of its samples times the
-        pixel's area, so with 1 it is the intensity at the pixel's centre.
-    shear : float
-        Increase of y with x on the sky, arcsec per arcsec (0 for square axes).
-    centre : tuple of float
-        x, y of the middle of the array on the image, arcsec.
-    """
-
-    shape: tuple[int, int]
-    pixelscale: tuple[float, float]
+    shape: tuple[int, int]  # (ny, nx) pixels
+    pixelscale: tuple[float, float]  # x, y, arcsec per pixel
+    # Samples per pixel along each axis. A pixel's value is the mean of its samples times the
+    # pixel's area, so with 1 it is the intensity at the pixel's centre.
     oversample: int
     dtype: torch.dtype
     device: torch.device
-    shear: float = 0.0
+    shear: float = 0.0  # increase of y with x on the sky, arcsec per arcsec
     name: str = "detector"
-    centre: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)  # x, y of the array's middle, arcsec
     parameters: tuple[str, ...] = ("detector_shift", "blur")
     # Not copied by `dataclasses.replace`, because a changed detector has other transforms.
     _transforms: Cache[tuple[float, PupilGrid], MatrixFourier] = field(
@@ -657,6 +568,8 @@ class Detector:
                 self.shear,
             )
 
+        # The transform to a detector that is shifted holds for one shift, which may need a
+        # derivative.
         key = (wavefront.wavelength, wavefront.grid)
         moved = "detector_shift" in values
         transform = make() if moved else self._transforms.kept(key, make)
@@ -681,11 +594,10 @@ class Detector:
 
 
 def _blur(image: Tensor, sigma: Tensor, axis: int) -> Tensor:
-    """Band-limited Gaussian convolution along one axis, mirrored at the edges.
-
-    Below half a sample a sampled Gaussian is a poor filter; its transform, cut at the Nyquist
-    frequency, is exact for a well-sampled image.
-    """
+    """Gaussian convolution along one axis (-1 or -2), mirrored at the edges; `sigma` in samples."""
+    # Below half a sample a sampled Gaussian is a poor filter. Its transform exp(-2 (pi sigma f)^2),
+    # cut at the Nyquist frequency, is exact for a well-sampled image. The kernel at a lag l is the
+    # integral of exp(-2 (pi sigma f)^2) cos(2 pi f l) over |f| < 1/2, by the midpoint rule.
     reach = 16
     frequency = (torch.arange(64, dtype=torch.float64, device=image.device) + 0.5) / 128
     gain = torch.exp(-2 * (math.pi * sigma.to(image.device) * frequency) ** 2)
@@ -697,6 +609,8 @@ def _blur(image: Tensor, sigma: Tensor, axis: int) -> Tensor:
 
 def mirrored_convolution(kernel: Tensor, count: int) -> Tensor:
     """Matrix (count, count) of the convolution with a symmetric kernel, mirrored at the edges."""
+    # Mirrored about the outer border of the edge pixel, with a period of 2 count: the sample before
+    # 0 is 0 again, that after count - 1 is count - 1 (scipy's "reflect").
     reach, device = len(kernel) // 2, kernel.device
     lag = torch.arange(-reach, reach + 1, device=device)
     folded = (torch.arange(count, device=device)[:, None] + lag) % (2 * count)
@@ -714,15 +628,11 @@ Effect = Callable[[Tensor], Tensor]
 
 
 class GaussianBlur:
-    """Convolution with a Gaussian as in `scipy.ndimage.gaussian_filter`.
+    """Convolution with a Gaussian of `sigma` samples as in `scipy.ndimage.gaussian_filter`.
 
     The kernel is sampled and ends at four standard deviations, rounded to whole samples: widths
-    below an eighth of a sample have no effect. The image is mirrored at its edges.
-
-    Parameters
-    ----------
-    sigma : float or Tensor, ()
-        Standard deviation in samples. A tensor may require gradients.
+    below an eighth of a sample have no effect. The image is mirrored at its edges. A tensor `sigma`
+    may require gradients.
     """
 
     def __init__(self, sigma: float | Tensor) -> None:
@@ -746,14 +656,9 @@ class GaussianBlur:
 
 
 class LinearResampling:
-    """Bilinear interpolation at given positions, zero outside the image.
+    """Bilinear interpolation of images of `shape`, zero outside the image.
 
-    Parameters
-    ----------
-    rows, columns : array_like, (ny, nx)
-        Position in the image of each sample of the result, in samples.
-    shape : tuple of int
-        Shape of the image.
+    `rows` and `columns`, (ny, nx), are the position in the image of each sample of the result.
     """
 
     def __init__(self, rows: ArrayLike, columns: ArrayLike, shape: tuple[int, int]) -> None:
@@ -762,6 +667,8 @@ class LinearResampling:
         top = np.clip(np.floor(y), 0, shape[0] - 2).astype(np.int64)
         left = np.clip(np.floor(x), 0, shape[1] - 2).astype(np.int64)
         down, right = y - top, x - left
+        # The value at (top + d, left + r) is the sum of four neighbours with weights (1 - d) or d
+        # times (1 - r) or r: one pair of flat indices and weights for each.
         self._taps = [
             (
                 torch.from_numpy((top + i) * shape[1] + left + j),
@@ -786,12 +693,10 @@ class LinearResampling:
 
 
 class PixelCrosstalk:
-    """Convolution of pixels with a small kernel of sum 1, zero beyond the edges (IPC, PPC).
+    """Convolution of pixels with a small `kernel` (odd, odd), scaled to sum 1 (IPC, PPC).
 
-    Parameters
-    ----------
-    kernel : array_like, (odd, odd)
-        Distribution of the signal of the middle pixel.
+    The kernel is the distribution of the signal of the middle pixel; beyond the edges there is
+    none.
     """
 
     def __init__(self, kernel: ArrayLike) -> None:
@@ -811,13 +716,7 @@ class PixelCrosstalk:
 
 @dataclass
 class ChainDetector(Detector):
-    """A detector with effects, before and after the samples are binned to pixels.
-
-    Attributes
-    ----------
-    on_samples, on_pixels : tuple of Effect
-        In order.
-    """
+    """A detector with effects, in order, before and after the samples are binned to pixels."""
 
     on_samples: tuple[Effect, ...] = ()
     on_pixels: tuple[Effect, ...] = ()

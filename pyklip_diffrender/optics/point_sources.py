@@ -63,31 +63,11 @@ _TESTED = 12
 class PointSources:
     """Images of point sources at the centres of detector pixels, many at a time.
 
-    Parameters
-    ----------
-    model : OpticalSystem
-    opd : Tensor, (npix, npix), optional
-        m; as in a call of the model.
-    values : mapping of str to value, optional
-        The model's other parameters. A ``star_offset`` is ignored: the positions are the pixels'.
-    sampling : float
-        Smallest number of cells of the occulter per lambda/D.
-    offset : tuple of float
-        x, y in arcsec from the centre of a pixel to the source.
-    wrapped : bool
-        Let the light of the mask's outer parts wrap around the detector, see
-        `optics.fast_path`. Images change by up to 5e-5, and take two thirds of the time.
-
-    Attributes
-    ----------
-    route : "lattice" or "model"
-        How images are computed: by convolution as described at the top of this module, or by
-        calling the model. The model is called if the planes are not one mask between pupil planes.
-        A mask of several parts is reduced to the first one if that changes the images of a few
-        test sources by a percent at most.
-    reach : float
-        Distance from the axis, arcsec, beyond which the mask is ignored, because it changes images
-        by a percent at most: they are then the same but for a shift, and cost next to nothing.
+    `opd` (npix, npix) in m and `values` are as in a call of the model, but a ``star_offset`` is
+    ignored: the positions are the pixels', moved by `offset`, x, y in arcsec. `sampling` is the
+    smallest number of cells of the occulter per lambda/D. With `wrapped`, the light of the mask's
+    outer parts may wrap around the detector (`optics.fast_path`): images change by up to 5e-5, and
+    take two thirds of the time.
     """
 
     def __init__(
@@ -108,6 +88,12 @@ class PointSources:
             if self._opd.ndim != 2:
                 raise ShapeError(f"opd: got shape {tuple(self._opd.shape)}, expected one map")
             self._values = {name: value.detach() for name, value in model.values(fixed).items()}
+            # `route` is "lattice", or "model" where images are calls of the model: if the planes
+            # are not one mask between pupil planes, or if a mask of several parts reduced to the
+            # first one changes the images of a few test sources by more than a percent. `reach`
+            # (arcsec) is the distance from the axis beyond which the mask is ignored, because it
+            # changes images by a percent at most: they are then the same but for a shift, and cost
+            # next to nothing.
             self._radius, self.reach, self._reduced = 0.0, math.inf, False
             self._waves = self._prepared(sampling)
             self.route = "lattice" if self._waves else "model"
@@ -167,6 +153,9 @@ class PointSources:
         ones = torch.ones((), dtype=model.dtype.to_complex(), device=model.device)
         stop = Wavefront(ones.expand(front.grid.shape), wavelength, front.grid)
         occulter = None
+        # Up to the occulter, planes act on the field of the source; those behind it are multiplied
+        # to one, because the kernel is the transform of their product. Without an occulter all act
+        # on the field.
         for plane, onto in zip(planes, windows, strict=True):
             if isinstance(plane, CompactOcculter):
                 occulter = plane
@@ -191,23 +180,11 @@ class PointSources:
         return centres + self._offset
 
     def images(self, rows: Index, columns: Index) -> Tensor:
-        """Images of point sources, each at `offset` from the middle of a pixel.
+        """Images of point sources in pixels `rows`, `columns`, (k,) each: (k, ny, nx), float32.
 
-        Parameters
-        ----------
-        rows, columns : (k,) of int
-            Indices of the pixels.
-
-        Returns
-        -------
-        Tensor, (k, ny, nx), float32
-            As ``model(opd, star_offset=position, **values)``: light per detector pixel as a
-            fraction of the light that the pupil collects.
-
-        Raises
-        ------
-        ShapeError
-            For pixels that are not on the detector.
+        They are ``model(opd, star_offset=position, **values)``: light per detector pixel as a
+        fraction of the light that the pupil collects. ShapeError for pixels that are not on the
+        detector.
         """
         rows, columns = self._indices(rows, columns)
         shape = (len(rows), *self.model.detector.shape)
@@ -279,20 +256,9 @@ def _one_mask(model: OpticalSystem, wavelength: float) -> list[Plane] | None:
 class _Wave:
     """Transforms on parts of the lattice at one wavelength.
 
-    Parameters
-    ----------
-    front : Wavefront
-        Field in front of the occulter for a source on the axis.
-    stop : Wavefront
-        Product of all planes behind the occulter.
-    occulter : CompactOcculter or None
-    detector : Detector
-    axes : tuple of Tensor
-        Sample positions x, y, radians.
-    sampling : float
-        Smallest number of cells per lambda/D.
-    wrapped : bool
-        See `PointSources`.
+    `front` is the field in front of the occulter for a source on the axis, `stop` the product of
+    all planes behind it, `axes` the sample positions x, y in radians; the rest as in
+    `PointSources`.
     """
 
     def __init__(
@@ -353,6 +319,8 @@ class _Wave:
         """Add the weighted intensities of sources to `total`, (k, samples in y, samples in x)."""
         k = self._oversample
         ny, nx = self._shape
+        # The tables start with the differences from the last pixel's source, so that the window of
+        # pixel (r, c) starts ny - 1 - r pixels further up and nx - 1 - c further right.
         up, left = ny - 1 - rows, nx - 1 - columns
         direct, *occulted = self._tables[total.dtype]
         field = _cut(direct, up * k, left * k, (ny * k, nx * k))

@@ -54,12 +54,11 @@ _registered = False
 
 
 def one_thread_after_fork() -> None:
-    """Let forked children of this process compute with one thread.
-
-    A fork copies the state of the thread pool of OpenMP, but not its threads: a child of a process
-    that has computed with several threads, such as a worker of `multiprocessing.Pool`, would wait
-    for them forever. One thread needs no pool. Children may not raise the number again.
-    """
+    """Let forked children of this process compute with one thread."""
+    # A fork copies the state of the thread pool of OpenMP, but not its threads: a child of a
+    # process that has computed with several threads, such as a worker of `multiprocessing.Pool`,
+    # would wait for them forever. One thread needs no pool. Children may not raise the number
+    # again.
     global _registered
     if not _registered and hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
@@ -78,21 +77,7 @@ not measured."""
 
 
 def batch_of(size: int, dtype: torch.dtype, device: torch.device) -> int:
-    """Return how many arrays to compute at a time, at least 1.
-
-    Parameters
-    ----------
-    size : int
-        Number of elements of the largest array for each member of the batch.
-    dtype : torch.dtype
-        Its type.
-    device : torch.device
-
-    Examples
-    --------
-    >>> batch_of(160 * 160, torch.complex64, torch.device("cpu"))
-    14
-    """
+    """Return how many arrays of `size` elements to compute at a time, at least 1."""
     available = _CPU_BYTES if device.type == "cpu" else _GPU_BYTES
     return max(1, int(available / (size * dtype.itemsize)))
 
@@ -193,19 +178,10 @@ class Propagation:
         Arrays, Quantities and maps with another number of pixels across the pupil are resampled,
         see `grid.resample`. Tensors keep their values, so that gradients flow, and must have the
         system's own size. None stands for the system's own wavefront, which is flat unless it was
-        made with one.
-
-        Raises
-        ------
-        ShapeError
-            For a map that is not square, or a tensor of another size.
-        UnitError, NonFiniteError
-            For a Quantity that is not a length, or values that are not finite.
-
-        Warns
-        -----
-        DiffrenderWarning
-            For an array whose rms inside the pupil is that of a wavefront in another unit.
+        made with one. ShapeError for a map that is not square or a tensor of another size,
+        UnitError for a Quantity that is not a length, NonFiniteError for values that are not
+        finite; a warning for an array whose rms inside the pupil is that of a wavefront in another
+        unit.
         """
         if opd is None and self.entrance.opd is not None:
             return self.entrance.opd
@@ -234,17 +210,10 @@ class Propagation:
     def values(self, parameters: Mapping[str, Value | None]) -> dict[str, Tensor]:
         """Check named parameter values and make them float64 tensors, (components,) each.
 
-        Quantities are converted to the unit of the parameter table. Parameters that are missing or
-        None get the system's `defaults`, if it has them.
-
-        Raises
-        ------
-        TypeError
-            For a name that this system does not take.
-        ShapeError
-            For a wrong number of components.
-        UnitError
-            For a Quantity of another kind.
+        Quantities are converted to the unit of the parameter table (UnitError if they are of
+        another kind). Parameters that are missing or None get the system's `defaults`, if it has
+        them. TypeError for a name that this system does not take, ShapeError for a wrong number of
+        components.
         """
         checked = dict(self.defaults)
         for name, value in parameters.items():
@@ -292,17 +261,8 @@ class Propagation:
     def plane_waves(self, wavefront: Wavefront, values: Values, reach: int) -> PlaneWaves | None:
         """Prepare the propagation of a field behind the entrance pupil times plane waves.
 
-        Parameters
-        ----------
-        wavefront : Wavefront
-        values : mapping of str to Tensor
-        reach : int
-            Largest number of cycles across the pupil array along an axis.
-
-        Returns
-        -------
-        PlaneWaves or None
-            None where that is not faster than `propagate`.
+        Waves have up to `reach` cycles across the pupil array along an axis. None where that is not
+        faster than `propagate`.
         """
         if self._lattice is None:
             return None
@@ -345,11 +305,6 @@ class Propagation:
         """Fraction of the collected light of a source far from the occulter that is detected.
 
         It is that of the planes in pupils, such as the Lyot stop, at the mean wavelength.
-
-        Parameters
-        ----------
-        opd, **parameters
-            As in a call of the system.
         """
         open_path = copy.copy(self)
         open_path.planes = tuple(each for each in self.planes if not each.focal)
@@ -361,17 +316,7 @@ class Propagation:
         return float(power * wavefront.grid.spacing**2)
 
     def field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
-        """Complex field on the detector's samples at a wavelength, (..., ny, nx).
-
-        Parameters
-        ----------
-        opd : Tensor, (..., npix, npix)
-            m; see `opd`.
-        wavelength : float
-            m.
-        values : mapping of str to Tensor
-            See `values`.
-        """
+        """Complex field on the detector's samples, (..., ny, nx), for an OPD from `opd`."""
         return self.propagate(self.pupil_field(opd, wavelength, values), values)
 
     def fields(self, opd: Value | None = None, **parameters: Value) -> list[Tensor]:
@@ -382,16 +327,9 @@ class Propagation:
     def image_of(
         self, fields: Sequence[Tensor], values: Values, weights: Tensor | None = None
     ) -> Tensor:
-        """Image from the fields at all wavelengths.
+        """Image (..., ny, nx) from the `fields` at all wavelengths.
 
-        Parameters
-        ----------
-        fields : sequence of Tensor
-            See `fields`.
-        values : mapping of str to Tensor
-            See `values`; only the detector's parameters matter.
-        weights : Tensor, (wavelengths,), optional
-            Replace the weights of the bandpass.
+        Of the `values` only the detector's matter; `weights` (wavelengths,) replace the bandpass's.
         """
         spectrum = self.bandpass.weights if weights is None else weights
         intensity = torch.zeros((), dtype=self.dtype, device=self.device)
@@ -434,12 +372,9 @@ class Propagation:
     ) -> dict[str, Tensor]:
         """The field at every named plane, in order.
 
-        Returns
-        -------
-        dict of str to Tensor
-            Pupil planes: the field behind the plane on its window of the pupil. Occulters: the
-            field in front of the mask, on its cells ("... focus"), then the field back in the
-            pupil. The detector: the field on its samples.
+        Pupil planes: the field behind the plane on its window of the pupil. Occulters: the field in
+        front of the mask, on its cells ("... focus"), then the field back in the pupil. The
+        detector: the field on its samples.
         """
         tensor, values = self.opd(opd), self.values(parameters)
         wavelength = wavelength or self.bandpass.wavelengths[0]
@@ -473,6 +408,7 @@ def _samples(system: Propagation, normalize: str, opd: Any, parameters: dict[str
         raise IncompatibleSetupError(
             f"normalize: got {normalize!r}, expected one of {', '.join(_NORMALIZATIONS)}"
         )
+    # Light adds up to 1 behind the entrance pupil, which is poppy's "first".
     total = np.zeros(())
     with torch.no_grad():
         tensor = system.opd(opd)
@@ -551,16 +487,7 @@ def _header(system: Propagation, normalize: str, header: fits.Header) -> None:
 def poppy_psf(
     system: Propagation, normalize: str = "first", opd: Any = None, **parameters: Any
 ) -> fits.HDUList:
-    """The return value of `poppy.OpticalSystem.calc_psf`: one oversampled image.
-
-    Parameters
-    ----------
-    system : OpticalSystem
-    normalize : "first", "last", "exit_pupil" or "none"
-        As in poppy.
-    opd, **parameters
-        As in a call of the system.
-    """
+    """The return value of `poppy.OpticalSystem.calc_psf`: one oversampled image; see `_samples`."""
     hdu = fits.PrimaryHDU(_samples(system, normalize, opd, parameters))
     _header(system, normalize, hdu.header)
     return fits.HDUList([hdu])
@@ -574,24 +501,10 @@ def instrument_psf(
     opd: Any = None,
     **parameters: Any,
 ) -> fits.HDUList:
-    """The return value of `poppy.Instrument.calc_psf`: samples, and the pixels they fall into.
+    """The return value of `poppy.Instrument.calc_psf`: extensions OVERSAMP (samples) and DET_SAMP.
 
-    Parameters
-    ----------
-    system : OpticalSystem
-    setup : mapping of str to str
-        See `OpticalSystem.setup`.
-    sampling : float, optional
-        Cells per lambda/D on the occulter, for the header.
-    normalize : "first", "last", "exit_pupil" or "none"
-        As in poppy.
-    opd, **parameters
-        As in a call of the system.
-
-    Returns
-    -------
-    HDUList
-        Extensions OVERSAMP and DET_SAMP.
+    `setup` is `OpticalSystem.setup`, `sampling` the cells per lambda/D on the occulter, for the
+    header; see `_samples` for `normalize`.
     """
     factor = system.detector.oversample
     primary = fits.PrimaryHDU(_samples(system, normalize, opd, parameters))
@@ -627,13 +540,7 @@ _SETUP_KEYWORDS = {
 
 
 def save(hdus: fits.HDUList, outfile: str | os.PathLike[str] | None, overwrite: bool) -> None:
-    """Write a PSF to a file, or do nothing if `outfile` is None.
-
-    Raises
-    ------
-    ExistingFileError
-        If the file exists and must not be overwritten.
-    """
+    """Write a PSF, unless `outfile` is None; ExistingFileError if it must not be replaced."""
     if outfile is None:
         return
     require_new([outfile], overwrite)

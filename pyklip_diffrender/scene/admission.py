@@ -76,37 +76,18 @@ _OTHER_TYPES = {
 
 @dataclass(eq=False)
 class FrameFile:
-    """A file that may become part of a sequence.
-
-    Attributes
-    ----------
-    path : Path
-    exposure : Exposure
-    star : str
-        Name of its star, the same for all files of the star.
-    reason : str
-        Why the file is excluded; empty for those that are not.
-    for_reference : bool
-        Whether it was asked for as a file of a reference star, whatever its header says.
-    is_product : bool
-        Whether the file holds something that was made from frames, and no frames.
-    place : tuple of float or None
-        x, y of the star in the file, 0-indexed pixels, which replaces that of the header.
-    frames : Observation or DiffrenderError, optional
-        Its frames, one for every integration, or why they cannot be read; None for a file that is
-        read when its frames are needed.
-    observation : Observation or None
-        The mean of the integrations of each pointing that are used, once they were read.
-    """
+    """A file that may become part of a sequence."""
 
     path: Path
     exposure: Exposure
-    star: str = ""
-    reason: str = field(default="", repr=False)
-    for_reference: bool = False
-    is_product: bool = False
-    place: tuple[float, float] | None = None
+    star: str = ""  # the same for all files of the star
+    reason: str = field(default="", repr=False)  # why it is excluded, or empty
+    for_reference: bool = False  # asked for as a reference star's, whatever its header says
+    is_product: bool = False  # made from frames, and has none
+    place: tuple[float, float] | None = None  # x, y of the star, from 0, if not the header's
+    # One for every integration, or why they cannot be read; None until they are needed.
     frames: Observation | DiffrenderError | None = field(default=None, repr=False)
+    # The mean of the integrations of each pointing that are used, once they were read.
     observation: Observation | None = field(default=None, repr=False)
 
     @classmethod
@@ -169,19 +150,10 @@ def exposures_in(
     files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     references: Iterable[str | os.PathLike[str]] = (),
 ) -> list[FrameFile]:
-    """Find FITS files and read what their headers say.
+    """Find FITS files, or those in folders, and read their headers; NoValidPixelsError for none.
 
-    Parameters
-    ----------
-    files : path or sequence of path
-        Files, or folders of them.
-    references : iterable of path
-        Files of reference stars. Files that are all marked as such, too, are then of the target.
-
-    Raises
-    ------
-    NoValidPixelsError
-        If there are no files.
+    Files that are all marked as those of reference stars are of the target if there are
+    `references`.
     """
     entries = [files] if isinstance(files, str | os.PathLike) else list(files)
     paths: list[Path] = []
@@ -251,12 +223,8 @@ def exclude_unusable(
 ) -> None:
     """Exclude files that cannot be frames of a star behind a mask, and duplicates.
 
-    Parameters
-    ----------
-    files : sequence of FrameFile
-    judge : callable
-        Reads files and excludes those with wrong pixels. Of several files of one exposure, it
-        decides which is the best that can be used.
+    `judge` reads files and excludes those with wrong pixels: of several files of one exposure, it
+    decides which is the best that can be used.
     """
     for each in admissible(files):
         each.reason = _why_unusable(each.exposure)
@@ -374,12 +342,8 @@ _TWO_STARS = 1.0
 def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
     """Exclude frames of other filters; returns the one that is left.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        If no filter was chosen and there are several, or none of the chosen one.
-    NoValidPixelsError
-        If no file states its filter.
+    IncompatibleSetupError if none was chosen and there are several, or none of the chosen one;
+    NoValidPixelsError if no file states its filter.
     """
     for each in admissible(files):
         if each.exposure.filter is None:
@@ -398,12 +362,9 @@ def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
 def choose_target(
     files: Sequence[FrameFile], target: str | None
 ) -> tuple[list[FrameFile], list[FrameFile]]:
-    """Tell stars apart; returns the frames of the target and those of reference stars.
+    """Tell stars apart: the frames of the target and those of reference stars.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        If the target cannot be decided, with the choices.
+    IncompatibleSetupError, with the choices, if the target cannot be decided.
     """
     usable = admissible(files)
     stars = frames_by_star(usable)
@@ -492,6 +453,8 @@ def _require_no_lost_target(
 
 def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
     """Group frames by star, by the proposer's name that most of them have."""
+    # A frame may be alike to several groups: by its name to one, by its coordinates to another.
+    # They then become one.
     groups: list[list[FrameFile]] = []
     for each in files:
         if not each.exposure.star.is_known:
@@ -550,6 +513,8 @@ def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[Fram
         lengths[each.exposure.setup] += each.exposure.integrations or 0
 
     def preference(setup: tuple[str | None, ...]) -> tuple[float, ...]:
+        # Of set-ups with as many frames of the target: the one with more cards, then with more
+        # frames of all stars, then with more integrations.
         known = sum(part is not None for part in setup)
         return counts[setup], known, everywhere[setup], lengths[setup]
 
@@ -569,10 +534,7 @@ def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[Fram
 def exclude_unoriented(science: Sequence[FrameFile]) -> None:
     """Exclude frames of the target whose roll or date is not known, where there are several.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        If it is known of none of them.
+    IncompatibleSetupError if it is known of none of them.
     """
     facts: tuple[tuple[str, Callable[[Exposure], object]], ...] = (
         ("orientation on the sky (ROLL_REF with V3I_YANG)", lambda each: each.position_angle),
@@ -617,19 +579,10 @@ def exclude_contradicting(
     files: Iterable[FrameFile],
     why: Callable[[Sequence[Observation]], Mapping[int, str]],
 ) -> None:
-    """Exclude frames that contradict the others.
+    """Exclude frames, of files that were read, that contradict the others.
 
-    Parameters
-    ----------
-    files : iterable of FrameFile
-        Files that were read.
-    why : callable
-        Reasons by index, such as `pixel_checks.why_turned`.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If half of the target's frames or more are, and nothing says which are right.
+    `why` gives reasons by index, such as `pixel_checks.why_turned`. IncompatibleSetupError if half
+    of the target's frames or more have one, and nothing says which are right.
     """
     usable = admissible(files)
     odd = why([_frames(each) for each in usable])
@@ -656,14 +609,7 @@ def _frames(file: FrameFile) -> Observation:
 
 
 def epochs_of(dates: Sequence[Time | None]) -> list[list[int]]:
-    """Indices of frames by epoch, in order of time; what has no date belongs to the first.
-
-    Examples
-    --------
-    >>> from astropy.time import Time
-    >>> epochs_of(Time(["2023-10-01", "2022-10-01", "2022-10-03"]))
-    [[1, 2], [0]]
-    """
+    """Indices of frames by epoch, in order of time; what has no date belongs to the first."""
     dated = [(float(date.mjd), k) for k, date in enumerate(dates) if date is not None]
     groups: list[list[int]] = []
     first = -np.inf
@@ -695,15 +641,10 @@ def _the_only(key: str, choice: str | None, values: Sequence[str | None]) -> str
 
 
 def require_agreement(observations: Sequence[Observation]) -> None:
-    """Check that observations can share a fit.
+    """Raise IncompatibleSetupError for observations that cannot share a fit.
 
     The frames of each have one place and orientation, their dates are at most 5 days apart, and
     where the orientation of one is known, or the frames are real, it is known of all.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        With the names of those that do not belong together.
     """
     for each in observations:
         parts = each.pointings()

@@ -141,21 +141,11 @@ telescope pointed."""
 
 @dataclass(frozen=True)
 class CatalogueStar:
-    """A star as a header describes it.
+    """A star as a header describes it."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The proposer's (TARGPROP) and the catalogue's (TARGNAME), where stated.
-    coordinates : tuple of float or None
-        Right ascension and declination, degrees.
-    pointing : bool
-        Whether these are the coordinates at which the telescope pointed, for want of the star's.
-    """
-
-    names: tuple[str, ...] = ()
-    coordinates: tuple[float, float] | None = None
-    pointing: bool = False
+    names: tuple[str, ...] = ()  # the proposer's (TARGPROP), the catalogue's (TARGNAME)
+    coordinates: tuple[float, float] | None = None  # RA and Dec, degrees
+    pointing: bool = False  # the coordinates are where the telescope pointed
 
     @property
     def is_known(self) -> bool:
@@ -225,73 +215,33 @@ _LAUNCH = 59573.0
 
 @dataclass(frozen=True)
 class Exposure:
-    """The facts about a file by which it is admitted to a sequence, or not.
-
-    Attributes
-    ----------
-    name : str
-        Name of the file.
-    level : str or None
-        Product of the pipeline, such as "calints".
-    exposure_type : str or None
-        EXP_TYPE.
-    identity : str or None
-        Programme, observation, visit, activity, exposure, detector and segment, as in the archive's
-        names of files.
-    instrument, detector, mask, stop, subarray, filter : str or None
-        The set-up; the mask without its module (MASK335R).
-    unit : str or None
-        BUNIT.
-    star : CatalogueStar
-    reference : bool or None
-        IS_PSF.
-    background : bool
-        Whether the exposure is of the background (BKGDTARG).
-    position_angle : float or None
-        Of the +y axis, degrees east of north.
-    date : Time or None
-        Beginning, UTC.
-    offset : tuple of float
-        XOFFSET and YOFFSET, dithers from the star's position; 0 where not stated.
-    integrations : int or None
-    """
+    """The facts by which a file is admitted to a sequence, or not; None where not stated."""
 
     name: str
-    level: str | None = None
-    exposure_type: str | None = None
-    identity: str | None = None
+    level: str | None = None  # product of the pipeline, such as "calints"
+    exposure_type: str | None = None  # EXP_TYPE
+    identity: str | None = None  # see `identity_of`
     instrument: str | None = None
     detector: str | None = None
-    mask: str | None = None
+    mask: str | None = None  # without its module, such as MASK335R
     stop: str | None = None
     subarray: str | None = None
     filter: str | None = None
-    unit: str | None = None
+    unit: str | None = None  # BUNIT
     star: CatalogueStar = field(default_factory=CatalogueStar)
-    reference: bool | None = None
-    background: bool = False
-    position_angle: float | None = None
-    date: Time | None = None
-    offset: tuple[float, float] = (0.0, 0.0)
+    reference: bool | None = None  # IS_PSF
+    background: bool = False  # of the background (BKGDTARG)
+    position_angle: float | None = None  # of +y, degrees east of north
+    date: Time | None = None  # beginning, UTC
+    offset: tuple[float, float] = (0.0, 0.0)  # XOFFSET, YOFFSET, arcsec; 0 where not stated
     integrations: int | None = None
 
     @classmethod
     def of(cls, header: fits.Header, name: str, shape: tuple[int, ...] = ()) -> Exposure:
-        """Read the facts from a merged header.
+        """Read the facts from the merged headers; `shape` is that of the science data.
 
-        Parameters
-        ----------
-        header : Header
-            Primary and science headers of the file, merged.
-        name : str
-            Name of the file.
-        shape : tuple of int
-            Of the science data.
-
-        Raises
-        ------
-        CorruptFileError
-            If a card holds something else than it should, or two cards contradict each other.
+        CorruptFileError if a card holds something else than it should, or two contradict each
+        other.
         """
 
         def text(key: str) -> str | None:
@@ -331,32 +281,10 @@ class Exposure:
 
 
 def image_mask(header: fits.Header, name: str) -> str | None:
-    """Image mask of a coronagraph, from CORONMSK, APERNAME or SUBARRAY.
+    """Image mask of a coronagraph, from CORONMSK, APERNAME or SUBARRAY (SUB320A335R: MASK335R).
 
-    Parameters
-    ----------
-    header : Header
-    name : str
-        The file's, for messages.
-
-    Returns
-    -------
-    str or None
-        Without the module, such as "MASK335R"; "NONE" where the header says that there is none, and
-        None where it does not say.
-
-    Raises
-    ------
-    CorruptFileError
-        If two of the cards name different masks.
-
-    Examples
-    --------
-    >>> from astropy.io import fits
-    >>> image_mask(fits.Header({"CORONMSK": "MASKA335R"}), "a.fits")
-    'MASK335R'
-    >>> image_mask(fits.Header({"SUBARRAY": "SUB320A430R"}), "a.fits")
-    'MASK430R'
+    "NONE" where the header says that there is none, None where it does not say; CorruptFileError if
+    two of the cards name different masks.
     """
     stated: dict[str, str] = {}
     for key in ("CORONMSK", "APERNAME", "SUBARRAY"):
@@ -384,29 +312,9 @@ def _agreed(
 
 
 def module_of(header: fits.Header, name: str) -> str | None:
-    """NIRCam's module, from the detector, MODULE, CORONMSK or SUBARRAY.
+    """NIRCam's module, "A" or "B", from the detector, MODULE, CORONMSK or SUBARRAY.
 
-    Parameters
-    ----------
-    header : Header
-    name : str
-        The file's, for messages.
-
-    Returns
-    -------
-    str or None
-        "A" or "B"; None where the header does not say.
-
-    Raises
-    ------
-    CorruptFileError
-        If two of the cards name different modules.
-
-    Examples
-    --------
-    >>> from astropy.io import fits
-    >>> module_of(fits.Header({"DETECTOR": "NRCBLONG", "CORONMSK": "MASKB335R"}), "a.fits")
-    'B'
+    None where the header does not say; CorruptFileError if two of the cards differ.
     """
     texts = {key: header_text(header, key, name) for key in ("MODULE", "CORONMSK", "SUBARRAY")}
     texts = {"DETECTOR": detector_of(header, name), **texts}
@@ -416,19 +324,7 @@ def module_of(header: fits.Header, name: str) -> str | None:
 
 
 def bar_place(header: fits.Header, name: str) -> str | None:
-    """Place of the star along a bar mask, from APERNAME.
-
-    Returns
-    -------
-    str or None
-        A filter or "NARROW", see `detector_place`; None where the header does not say.
-
-    Examples
-    --------
-    >>> from astropy.io import fits
-    >>> bar_place(fits.Header({"APERNAME": "NRCA5_MASKLWB_F460M"}), "a.fits")
-    'F460M'
-    """
+    """Place of the star along a bar, from APERNAME: a filter or "NARROW", see `detector_place`."""
     text = (header_text(header, "APERNAME", name) or "").upper()
     match = re.search(r"MASK[LS]WB_(F\d{3}W2?|F\d{3}M|F\d{3}N|NARROW)$", text)
     return match[1] if match else None
@@ -450,19 +346,10 @@ def is_reference(header: fits.Header) -> bool | None:
 def position_angle(header: fits.Header, name: str) -> float | None:
     """Position angle of the +y axis of a JWST image, degrees east of north, from 0 to 360.
 
-    It is ROLL_REF with V3I_YANG, the angle from V3 to +y. Where the latter is missing, PA_APER
-    states the sum.
-
-    Returns
-    -------
-    float or None
-        None if the cards do not say.
-
-    Raises
-    ------
-    CorruptFileError
-        If the cards contradict each other.
+    None if the cards do not say; CorruptFileError if they contradict each other.
     """
+    # ROLL_REF, of V3, with V3I_YANG, the angle from V3 to +y. Where the latter is missing, PA_APER
+    # states the sum.
     roll, angle, parity, total = (
         header_number(header, key, name) for key in ("ROLL_REF", "V3I_YANG", "VPARITY", "PA_APER")
     )
@@ -478,19 +365,10 @@ def position_angle(header: fits.Header, name: str) -> float | None:
 
 
 def beginning(header: fits.Header, name: str) -> Time | None:
-    """Beginning of an exposure, UTC.
+    """Beginning of an exposure, UTC; None if the header does not say.
 
-    It is DATE-BEG, DATE-OBS with TIME-OBS, EXPSTART, or the day of DATE-OBS alone.
-
-    Returns
-    -------
-    Time or None
-        None if the header does not say.
-
-    Raises
-    ------
-    CorruptFileError
-        If a card does not hold a date.
+    It is DATE-BEG, DATE-OBS with TIME-OBS, EXPSTART, or the day of DATE-OBS alone. CorruptFileError
+    if a card does not hold a date.
     """
     dates = header_date(header, ("DATE-BEG",), name), day_and_time(header, name)
     date = next((each for each in dates if each is not None), None)
@@ -511,10 +389,7 @@ def beginning(header: fits.Header, name: str) -> Time | None:
 def middle(header: fits.Header, name: str) -> Time | None:
     """Middle of an exposure, UTC (EXPMID); None if the header does not say.
 
-    Raises
-    ------
-    CorruptFileError
-        If it is more than two days from the beginning.
+    CorruptFileError if it is more than two days from the beginning.
     """
     day = header_number(header, "EXPMID", name)
     if not day:

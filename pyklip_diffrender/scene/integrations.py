@@ -234,18 +234,10 @@ _SAME_ANGLE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """Integrations and pixels of a file that are used.
+    """Integrations and pixels of a file that are used."""
 
-    Attributes
-    ----------
-    kept : ndarray of bool, (frames,)
-        Integrations that are used.
-    remarks : tuple of str
-        Integrations and pixels that were left out, and why.
-    """
-
-    kept: NDArray[np.bool_]
-    remarks: tuple[str, ...]
+    kept: NDArray[np.bool_]  # (frames,), integrations that are used
+    remarks: tuple[str, ...]  # what was left out, and why
 
 
 def compressed(stack: NDArray[Any], kept: NDArray[np.bool_]) -> NDArray[Any]:
@@ -258,13 +250,9 @@ def compressed(stack: NDArray[Any], kept: NDArray[np.bool_]) -> NDArray[Any]:
 
 
 def empty_integrations(data: Stack, valid: Iterable[Mask]) -> Judgement:
-    """Find integrations without usable pixels, or whose pixels all have one value.
+    """Find integrations without `valid` pixels, or whose pixels all have one value.
 
-    Parameters
-    ----------
-    data : ndarray, (frames, ny, nx)
-    valid : iterable of ndarray of bool, (ny, nx)
-        Finite pixels of every frame with errors and without flags.
+    `data` is (frames, ny, nx), each of `valid` (ny, nx).
     """
     kept = np.ones(len(data), dtype=bool)
     remarks = []
@@ -290,36 +278,27 @@ def judge_integrations(
     names: Sequence[str],
     group: NDArray[np.intp] | None = None,
 ) -> Judgement:
-    """Compare integrations of one pointing with their median.
+    """Compare integrations of one pointing, (frames, ny, nx), with their median.
 
-    The star's light may move by a twentieth of a pixel and change by 3 % between integrations.
-    Larger deviations that are significant are masked; an integration is left out if they are a
-    quarter of the pixels within 3 arcsec of the star, or if its star is 15 % brighter or fainter.
-    The stacks are never copied as a whole, because they may be larger than the memory.
-
-    Parameters
-    ----------
-    data, error : ndarray, (frames, ny, nx)
-    valid : ndarray of bool, (frames, ny, nx)
-        Pixels that deviate are masked in place.
-    center : ndarray, (frames, 2)
-        x, y of the star.
-    pixelscale : tuple of float
-        x, y, arcsec per pixel.
-    names : sequence of str
-        Names of the integrations in remarks, such as "integration 3 of 8".
-    group : ndarray of int, optional
-        Indices of the integrations of the pointing; default all.
+    Pixels that deviate are masked in `valid`, in place. `center` is x, y of the star, (frames, 2),
+    in pixels, `pixelscale` x, y in arcsec per pixel, `names` are those of the integrations in
+    remarks, such as "integration 3 of 8", and `group` has the indices of the pointing's
+    integrations.
     """
     group = np.arange(len(data)) if group is None else group
     kept = np.ones(len(data), dtype=bool)
     if len(group) < _FEW:
         return Judgement(kept, ())
+    # The star may move by a twentieth of a pixel between integrations and its light change by 3 %.
+    # Larger deviations that are significant are masked; an integration is left out if they are a
+    # quarter of the pixels within 3 arcsec of the star, or if its star is 15 % brighter or fainter.
+    # The stacks are never copied as a whole, because they may be larger than the memory.
     median = _median(data, valid, group)
     rows, columns = np.indices(median.shape)
     x, y = center[group].mean(axis=0)
     near = np.hypot((columns - x) * pixelscale[0], (rows - y) * pixelscale[1]) < _NEAR
     remarks = []
+    # A star that moves by d changes a pixel by its slope times d.
     slopes = np.hypot(*np.gradient(median))
     allowed = _JITTER * slopes + _CHANGE * np.abs(median)
     for k in group:
@@ -362,12 +341,7 @@ def judge_pointings(
 ) -> Judgement:
     """Compare the integrations of every pointing with their median, see `judge_integrations`.
 
-    Parameters
-    ----------
-    data, error, valid, center, pixelscale, names
-        See `judge_integrations`, which masks pixels in place.
-    angles : ndarray, (frames,), or None
-        Position angles, degrees.
+    `angles` are position angles in degrees, (frames,), or None.
     """
     kept = np.ones(len(data), dtype=bool)
     remarks: tuple[str, ...] = ()
@@ -384,6 +358,8 @@ def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
     rows = max(1, _AT_ONCE // (len(group) * data.shape[2]))
     for first in range(0, len(median), rows):
         part = slice(first, first + rows)
+        # Masked pixels are sorted to the end, so that the median of the valid ones is the mean of
+        # the two in the middle of the first `count`.
         usable = valid[group, part]
         ordered = np.sort(np.where(usable, data[group, part], np.inf), axis=0)
         count = usable.sum(axis=0)
@@ -396,6 +372,7 @@ def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
 
 def _brightness(frame: Stack, median: Stack, sigma: Stack, usable: Mask) -> float:
     """Brightness of the star over that in the median; 1 if the star is not seen."""
+    # sum of (frame - a median)^2 is minimal at a = sum of frame median / sum of median^2.
     bright = usable & (median > _BRIGHT * sigma)
     norm = float((median[bright] ** 2).sum())
     return float((frame[bright] * median[bright]).sum() / norm) if norm > 0 else 1.0
@@ -423,20 +400,13 @@ def _deviating(difference: Stack, sigma: Stack, usable: Mask, allowed: Stack) ->
 
 
 def pointings(center: Stack, angles: NDArray[np.float64] | None) -> Iterator[NDArray[np.intp]]:
-    """Sort frames by where and how they show the star.
+    """Indices of frames that can be averaged, one array for each place and angle of the star.
 
-    Parameters
-    ----------
-    center : ndarray, (frames, 2)
-        x, y of the star, pixels.
-    angles : ndarray, (frames,), or None
-        Position angles, degrees.
-
-    Yields
-    ------
-    ndarray of int
-        Indices of frames that can be averaged.
+    `center` is x, y of the star in pixels, (frames, 2); `angles` are in degrees, (frames,), or
+    None.
     """
+    # Groups are formed about the first frame that is left, so that none is wider than twice the
+    # limits.
     left = np.ones(len(center), dtype=bool)
     turns = np.zeros(len(center)) if angles is None else angles
     while left.any():
@@ -491,57 +461,27 @@ def calibrated_errors(
     *,
     out: Image | None = None,
 ) -> tuple[Image, tuple[float, ...]]:
-    """Correct the part of the errors that does not depend on the light.
+    """Correct the part of the errors, (frames, ny, nx), that does not depend on the light.
 
-    Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star and
-    where the frame is dark, see `dark_pixels`. The
-    robust scatter of these differences over what the errors predict is the factor f by which the
-    errors there are wrong. Let b be the median of these errors: (f^2 - 1) b^2 is added to the
-    variance of every pixel, which leaves the photon noise of the star as it is.
-
-    Parameters
-    ----------
-    data, error : ndarray, (frames, ny, nx)
-        Frames and their standard deviations, in the same unit.
-    valid : ndarray of bool, (frames, ny, nx)
-    center : ndarray, (frames, 2)
-        x, y of the star, 0-indexed pixels.
-    pixelscale : tuple of float
-        x, y, arcsec per pixel.
-    name : str
-        For the log.
-    out : ndarray, (frames, ny, nx), optional
-        For the new errors, in place of a new array; may be `error`.
-
-    Returns
-    -------
-    errors : ndarray, (frames, ny, nx)
-        New standard deviations. Frames with fewer than 2000 usable pixels that far from the star
-        keep theirs.
-    ratios : tuple of float
-        f of every frame; NaN where there are too few pixels.
-
-    Notes
-    -----
-    Noise that neighbouring pixels share, such as 1/f noise, cancels in the differences and is not
-    counted.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> noise = np.random.default_rng(1).normal(0.0, 0.5, (1, 300, 300))
-    >>> ones = np.ones_like(noise)
-    >>> center = np.array([[150, 150]])
-    >>> error, (ratio,) = calibrated_errors(noise, ones, ones > 0, center, (0.063, 0.063))
-    >>> bool(abs(error.mean() - 0.5) < 0.01), bool(abs(ratio - 0.5) < 0.01)
-    (True, True)
+    `center` is x, y of the star, (frames, 2), 0-indexed, `pixelscale` x, y in arcsec per pixel. The
+    new errors are written to `out`, which may be `error`. The second value has for every frame the
+    factor by which its errors were wrong. Frames with fewer than 2000 usable pixels far from the
+    star keep their errors, and their factor is NaN.
     """
+    # Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star and
+    # where the frame is dark. The robust scatter of these differences over what the errors predict
+    # is the factor f by which the errors there are wrong. With b the median of these errors,
+    # (f^2 - 1) b^2 is added to the variance of every pixel, which leaves the photon noise of the
+    # star as it is. Noise that neighbouring pixels share, such as 1/f noise, cancels in the
+    # differences and is not counted.
     corrected, ratios = error.copy() if out is None else out, []
     for k, (ratio, floor) in enumerate(_measured(data, error, valid, center, pixelscale)):
         ratios.append(ratio)
         if not ratio > 0:
             continue
         sigma = error[k].astype(float)
+        # An error below b would get too small or even a negative variance if f < 1: no error is
+        # multiplied by less than f.
         least = min(ratio, 1.0) * sigma
         variance = np.maximum(sigma**2 + (ratio**2 - 1) * floor**2, least**2)
         corrected[k] = np.where(valid[k], np.sqrt(variance), sigma)
@@ -555,27 +495,15 @@ def weighted_mean(
     valid: NDArray[np.bool_],
     which: Iterable[int] | None = None,
 ) -> tuple[Image, Image, NDArray[np.bool_]]:
-    """Mean of frames, (frames, ny, nx), each weighted by its inverse median variance.
+    """Mean and error, (ny, nx), of frames (frames, ny, nx), and where they are valid.
 
-    The errors of single pixels are no weights: they come from the counts of the pixels, so that
-    low counts would weigh more, and the mean would be too low. `which` are the indices of the
-    frames, by default of all.
-
-    Returns
-    -------
-    mean, error : ndarray, (ny, nx)
-        0 and 1 where no frame is valid.
-    valid : ndarray of bool, (ny, nx)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> counts = np.random.default_rng(1).poisson(5.0, (400, 10, 10)).astype(float)
-    >>> error = np.sqrt(np.maximum(counts, 1.0))
-    >>> mean, deviation, _ = weighted_mean(counts, error, counts >= 0)
-    >>> bool(abs((mean - 5.0).mean()) < 0.3 * deviation.mean())
-    True
+    Mean and error are 0 and 1 where no frame is valid. `which` are the indices of the frames, by
+    default of all.
     """
+    # Weights are the inverse median variances of the frames: m = sum of w d / sum of w, with the
+    # variance sum of w^2 s^2 / (sum of w)^2. The errors of single pixels are no weights: they come
+    # from the counts of the pixels, so that low counts would weigh more, and the mean would be too
+    # low.
     light, noise, total = np.zeros((3, *data.shape[1:]))
     # Frame by frame, which takes no memory.
     for k in range(len(data)) if which is None else which:
@@ -592,33 +520,12 @@ def weighted_mean(
 
 
 def dark_pixels(frame: Image, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Find the pixels of a frame that show noise, and no other stars, galaxies or nebulae.
-
-    The light is averaged over squares of 15 pixels, so that the noise of a pixel does not decide
-    whether it counts. Dark is what is at most four standard deviations above the median of these
-    means, or the darkest quarter of a field that is full of sources.
-
-    Parameters
-    ----------
-    frame : ndarray, (ny, nx)
-    usable : ndarray of bool, (ny, nx)
-        Pixels that may be chosen.
-
-    Returns
-    -------
-    ndarray of bool, (ny, nx)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> frame = np.random.default_rng(1).normal(size=(60, 60))
-    >>> frame[:, :10] += 5.0
-    >>> dark = dark_pixels(frame, np.ones((60, 60), dtype=bool))
-    >>> bool(dark[:, :10].any()), bool(dark[:, 20:].mean() > 0.98)
-    (False, True)
-    """
+    """Find the usable pixels (ny, nx) with noise, and without other stars, galaxies or nebulae."""
     if not usable.any():
         return usable
+    # The light is averaged over squares of 15 pixels, so that the noise of a pixel does not decide
+    # whether it counts. Dark is what is at most four standard deviations above the median of these
+    # means, or the darkest quarter of a field that is full of sources.
     # A single bright pixel is an outlier, and no source.
     median = np.median(frame[usable])
     limit = 5 * median_abs_deviation(frame[usable], scale="normal")
@@ -628,6 +535,7 @@ def dark_pixels(frame: Image, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     values = smooth[usable]
     middle = float(np.median(values))
     below = middle - values[values <= middle]
+    # 0.6745 is the median of |x| for a normal x of variance 1.
     # The scatter of the darker half, which sources do not reach.
     spread = float(np.median(below)) / 0.6745
     threshold = max(middle + _STARLIT * spread, float(np.quantile(values, _DARKEST)))
@@ -635,13 +543,7 @@ def dark_pixels(frame: Image, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def why_odd_noise(ratios: Iterable[float]) -> str:
-    """Why errors cannot be those of the pixels; empty if they can.
-
-    Parameters
-    ----------
-    ratios : iterable of float
-        See `calibrated_errors`.
-    """
+    """Why errors with the ratios of `calibrated_errors` are not the pixels', or an empty text."""
     low, high = _PLAUSIBLE
     for ratio in ratios:
         if np.isfinite(ratio) and not low < ratio < high:
@@ -672,6 +574,8 @@ def _measured(
         if far.sum() < _ENOUGH:
             yield np.nan, np.nan
             continue
+        # The difference x - (a + b + c + d) / 4 has the variance s_x^2 + (s_a^2 + s_b^2 + s_c^2 +
+        # s_d^2) / 16, and `convolve` averages four.
         difference = frame - convolve(frame, _NEIGHBOURS, mode="nearest")
         predicted = np.sqrt(sigma**2 + convolve(sigma**2, _NEIGHBOURS, mode="nearest") / 4)
         ratio = float(median_abs_deviation((difference / predicted)[far], scale="normal"))

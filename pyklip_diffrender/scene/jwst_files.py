@@ -113,30 +113,10 @@ _PART = 0.1
 def recorded_shifts(
     hdus: fits.HDUList, center: NDArray[np.float64], shape: tuple[int, ...], name: str
 ) -> NDArray[np.float64] | None:
-    """By how much spaceKLIP has shifted the frames of a file.
+    """By how much spaceKLIP has shifted the frames of a file, (frames, 2), x, y in pixels, or None.
 
-    Since release 2.2, CENTER_SHIFT moves the star to the centre of the array, and ALIGN_SHIFT
-    aligns the frames with each other. Both are recorded before the frames are shifted.
-
-    Parameters
-    ----------
-    hdus : HDUList
-    center : ndarray, (2,)
-        x, y of the star in the first frame, 0-indexed.
-    shape : tuple of int
-        Number of frames, rows and columns.
-    name : str
-        The file's, for messages.
-
-    Returns
-    -------
-    ndarray, (frames, 2), or None
-        x, y, pixels; None if the frames were not shifted.
-
-    Raises
-    ------
-    ShapeError, NonFiniteError
-        If there are not two finite numbers for every frame.
+    `center` is x, y of the star in the first frame, 0-indexed, `shape` frames, rows and columns.
+    ShapeError or NonFiniteError if there are not two finite numbers for every frame.
     """
     shifts = {}
     for key in SHIFTS:
@@ -151,6 +131,8 @@ def recorded_shifts(
             require_finite(shifts[key], f"{name}: {key}")
     if not shifts or "IMSHIFTS" in shifts:
         return shifts.get("IMSHIFTS")
+    # Since release 2.2, CENTER_SHIFT moves the star to the centre of the array, and ALIGN_SHIFT
+    # aligns the frames with each other. Both are recorded before the frames are shifted.
     if "CENTER_SHIFT" in shifts:
         middle = (np.array(shape[:0:-1]) - 1) / 2
         if (np.abs(center + shifts["CENTER_SHIFT"][0] - middle) < _AT_CENTER).all():
@@ -159,20 +141,10 @@ def recorded_shifts(
 
 
 def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
-    """Where the centre of a coronagraph's mask is imaged on the whole detector.
+    """Where the mask's centre is imaged on the whole detector, x, y in pixels from 0, (2,).
 
-    Parameters
-    ----------
-    header : Header
-        DETECTOR, FILTER, and the mask in CORONMSK, APERNAME or SUBARRAY.
-    name : str
-        The file's, for messages.
-
-    Returns
-    -------
-    ndarray, (2,), or None
-        x, y, pixels from 0; None if the header does not say, or where it was not measured, as in
-        module B.
+    By DETECTOR, FILTER, and the mask in CORONMSK, APERNAME or SUBARRAY. None if the header does not
+    say, or where it was not measured, as in module B.
     """
     detector, mask = detector_of(header, name), image_mask(header, name)
     if detector is None or mask is None or module_of(header, name) == "B":
@@ -190,26 +162,14 @@ def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
 def net_shifts(
     shifts: NDArray[np.float64], star: NDArray[np.float64], mask: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """How far the light of every frame is from the pixels that it fell on.
+    """How far the light of every frame is from the detector's pixels that it fell on, (frames, 2).
 
-    A file records by how much its frames were shifted, but not by how many whole pixels they were
-    cut or padded afterwards, all alike. Those follow from the position of the star, which was
-    within half a pixel of the centre of the mask.
-
-    Parameters
-    ----------
-    shifts : ndarray, (frames, 2)
-        x, y, see `recorded_shifts`.
-    star : ndarray, (frames, 2)
-        x, y of the star in the array.
-    mask : ndarray, (2,), or None
-        x, y of the mask on the detector, see `mask_place`.
-
-    Returns
-    -------
-    ndarray, (frames, 2)
-        x, y, pixels from the detector's. Without a mask, whole pixels are left out.
+    `shifts` and `star`, the star in the array, are (frames, 2), `mask` is that on the detector,
+    (2,), all x, y in pixels. Without a mask, whole pixels are left out.
     """
+    # A file records by how much its frames were shifted, but not by how many whole pixels they were
+    # cut or padded afterwards, all alike. These follow from the star, which was within half a pixel
+    # of the mask's centre: star = mask + shift + whole pixels + less than a half.
     if mask is None:
         return np.asarray(shifts - np.round(shifts.mean(axis=0)))
     return np.asarray(shifts + np.round(np.median(star - mask - shifts, axis=0)))
@@ -218,24 +178,12 @@ def net_shifts(
 def first_pixel(
     header: fits.Header, star: NDArray[np.float64], shape: tuple[int, ...], name: str
 ) -> tuple[int, int] | None:
-    """Detector column and row of the first pixel of an array that was not moved.
+    """Detector column and row, from 0, of the first pixel of an array that was not moved.
 
-    Parameters
-    ----------
-    header : Header
-        SUBSTRT1 and SUBSTRT2 are the first column and row of the subarray, 1-indexed.
-    star : ndarray, (2,)
-        x, y of the star in the array, 0-indexed.
-    shape : tuple of int
-        Rows and columns of the array.
-    name : str
-        The file's, for messages.
-
-    Returns
-    -------
-    tuple of int or None
-        0-indexed. None if the header does not say, or says what cannot be: an array off the
-        detector, or a star away from the mask. The pattern of the flat field may show the place.
+    `star` is x, y in the array, 0-indexed, (2,), and `shape` its rows and columns. SUBSTRT1 and
+    SUBSTRT2 are the first column and row of the subarray, 1-indexed. None if the header does not
+    say, or says what cannot be: an array off the detector, or a star away from the mask. The
+    pattern of the flat field may show the place.
     """
     start = [header_number(header, key, name) for key in ("SUBSTRT1", "SUBSTRT2")]
     if None in start:
@@ -264,25 +212,16 @@ def on_detector(first: tuple[int, int], shape: tuple[int, ...]) -> bool:
 def undo_shifts(
     data: NDArray[np.float64], error: NDArray[np.float64], shifts: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Shift frames that have gaps, without spreading the gaps.
+    """Shift frames (frames, ny, nx) with gaps by less than a pixel, without spreading the gaps.
 
-    A Fourier shift makes every pixel depend on all pixels of its row and column. Gaps are filled
-    from their neighbours before it; how wrong that may be is added to the variance of the pixels
-    that depend on it, and pixels where it would be more than a quarter of the variance are masked.
-
-    Parameters
-    ----------
-    data, error : ndarray, (frames, ny, nx)
-        Frames and standard deviations. Gaps are not finite; errors of 0 or less are gaps, too.
-    shifts : ndarray, (frames, 2)
-        x, y in pixels, less than one.
-
-    Returns
-    -------
-    data, error : ndarray, (frames, ny, nx)
-    valid : ndarray of bool, (frames, ny, nx)
-        False where a gap is, or matters.
+    Gaps are not finite; errors of 0 or less are gaps, too. `shifts` are x, y in pixels,
+    (frames, 2). The result has the frames, their errors, and the valid pixels, which are no gaps
+    and do not depend on any.
     """
+    # A Fourier shift makes every pixel depend on all pixels of its row and column. Gaps are filled
+    # from their neighbours before it; how wrong that may be is added to the variance of the pixels
+    # that depend on it, and pixels where it would be more than a quarter of the variance are
+    # masked.
     missing = ~np.isfinite(data)
     unknown = ~(np.isfinite(error) & (error > 0))
     pairs = [filled(frame, gap) for frame, gap in zip(data, missing, strict=True)]
@@ -298,26 +237,15 @@ def undo_shifts(
 def shift_variances(
     error: NDArray[np.float64], known: NDArray[np.bool_], shifts: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Variances of shifted frames, from standard deviations before the shift.
+    """Variances of shifted frames, (frames, ny, nx), from standard deviations before the shift.
 
-    Variances ring where a pixel has a much larger one than its neighbours; they are not allowed
-    below the smallest of the pixels around.
-
-    Parameters
-    ----------
-    error : ndarray, (frames, ny, nx)
-        Any value where not `known`.
-    known : ndarray of bool, (frames, ny, nx)
-    shifts : ndarray, (frames, 2)
-        x, y in pixels.
-
-    Returns
-    -------
-    ndarray, (frames, ny, nx)
+    Errors have any value where not `known`; `shifts` are x, y in pixels, (frames, 2).
     """
     variance = np.empty_like(error)
     for k, (sigma, good) in enumerate(zip(error, known, strict=True)):
         variance[k] = 1.0 if not good.any() else _nearest(np.where(good, sigma, 1.0) ** 2, ~good)
+    # Variances ring where a pixel has a much larger one than its neighbours; they are not allowed
+    # below the smallest of the pixels around.
     least = np.stack([minimum_filter(each, 3, mode="nearest") for each in variance])
     return np.maximum(shift_frames(variance, shifts), least)
 
@@ -325,21 +253,11 @@ def shift_variances(
 def filled(
     frame: NDArray[np.float64], gaps: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fill the gaps of an image from their neighbours.
-
-    The estimate is the best linear one for a random image with the resolution of the telescope
-    (kriging); how well it predicts the neighbours of a gap from the others says how good it is.
-
-    Parameters
-    ----------
-    frame : ndarray, (ny, nx)
-    gaps : ndarray of bool, (ny, nx)
-
-    Returns
-    -------
-    image, doubt : ndarray, (ny, nx)
-        Without gaps; and the standard deviation of what was filled in, 0 elsewhere.
-    """
+    """Fill the gaps of an image (ny, nx), and say how well: the standard deviation, 0 elsewhere."""
+    # The estimate is the best linear one for a random image with the resolution of the telescope
+    # (kriging): with the covariance C of the neighbours v, of mean m, and c between them and the
+    # gap, m + c C^-1 (v - m). How well each neighbour near the gap is predicted from the others,
+    # without any further solution [C^-1 (v - m)]_i / [C^-1]_ii, says how good it is.
     doubt = np.zeros_like(frame)
     if not gaps.any() or gaps.all():
         return np.where(gaps, 0.0, frame), doubt
@@ -389,6 +307,8 @@ def _spread(squares: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArra
     for k, (variance, shift) in enumerate(zip(squares, shifts, strict=True)):
         if not variance.any():
             continue
+        # A shifted pixel is the sum of k_j x_j, the kernel k being the shift of a single pixel, and
+        # has the variance sum of k_j^2 v_j.
         kernel = np.zeros_like(variance)
         # Where `fftconvolve` has the origin of a kernel.
         kernel[(kernel.shape[0] - 1) // 2, (kernel.shape[1] - 1) // 2] = 1.0
@@ -398,19 +318,7 @@ def _spread(squares: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArra
 
 
 def shift_frames(frames: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shift frames by fractions of a pixel with the Fourier transform.
-
-    Parameters
-    ----------
-    frames : ndarray, (frames, ny, nx)
-        Without NaN.
-    shifts : ndarray, (frames, 2)
-        x, y in pixels.
-
-    Returns
-    -------
-    ndarray, (frames, ny, nx)
-    """
+    """Fourier-shift frames (frames, ny, nx), without NaN, by x, y in pixels, (frames, 2)."""
     inner = slice(_PAD, -_PAD)
     shifted = np.empty_like(frames)
     for k, (frame, (x, y)) in enumerate(zip(frames, shifts, strict=True)):
@@ -451,26 +359,11 @@ def read_calints(
     compact: bool = False,
     star: tuple[float, float] | None = None,
 ) -> tuple[dict[str, Any], NDArray[Any] | None]:
-    """Read an open calints file; see `Observation.from_fits`.
+    """Read an open calints file: arguments of `Observation.from_arrays`, and `recorded_shifts`.
 
-    Parameters
-    ----------
-    hdus : HDUList
-        From `open_fits`, whose images need not be read.
-    path : path
-        The file's.
-    compact : bool
-        Keep pixels and errors in single precision if the file does: with the mask they then take
-        three quarters of the file's size.
-    star : tuple of float, optional
-        x, y of the star, in place of what the header says.
-
-    Returns
-    -------
-    arguments : dict
-        Arguments of `Observation.from_arrays`.
-    shifts : ndarray, (frames, 2), or None
-        By how much spaceKLIP has shifted the frames, see `recorded_shifts`.
+    The images of `hdus`, from `open_fits`, need not be read. `star` is its x, y in pixels from 0,
+    in place of what the header says. `compact` keeps pixels and errors in single precision if the
+    file has them so.
     """
     name = Path(path).name
     if "SCI" not in hdus:
@@ -484,6 +377,7 @@ def read_calints(
             raise CorruptFileError(f"{name}: {hdu.name} is a table, not an image")
         if hdu.name in ("SCI", "ERR", "DQ") and not hdu.shape:
             raise CorruptFileError(f"{name}: {hdu.name} has no data, so no frames")
+    # With the mask, pixels and errors in single precision take three quarters of the file's size.
     single = compact and science.header["BITPIX"] == -32
     as_float = _single_precision if single else native_float64
     data = read_image(science, path, as_float)
@@ -576,22 +470,9 @@ def without_empty(
 
 
 def dither(header: fits.Header, name: str) -> tuple[float, float] | None:
-    """Read the position of a dithered star relative to the mask.
-
-    Dithers on a small grid (XOFFSET, YOFFSET) move the star behind the mask, and on the detector,
-    from the position that CRPIX states.
-
-    Parameters
-    ----------
-    header : Header
-    name : str
-        The file's, for messages.
-
-    Returns
-    -------
-    tuple of float or None
-        x, y, arcsec; None without a dither, or with one that takes the star off the mask.
-    """
+    """x, y of a dithered star from the mask, arcsec; None without a dither, or off the mask."""
+    # Dithers on a small grid (XOFFSET, YOFFSET) move the star behind the mask, and on the detector,
+    # from the position that CRPIX states.
     x, y = (header_number(header, key, name) or 0.0 for key in ("XOFFSET", "YOFFSET"))
     return (x, y) if 0 < np.hypot(x, y) < BEHIND_THE_MASK else None
 
@@ -659,24 +540,11 @@ def on_detector_pixels(
     *,
     is_measured: bool = True,
 ) -> dict[str, Any]:
-    """Undo the shifts by which frames were aligned, up to whole pixels.
+    """Undo the shifts by which frames were aligned, up to whole pixels: the changed arguments.
 
-    Parameters
-    ----------
-    arguments : dict
-        See `read_calints`. Its arrays are overwritten.
-    center : ndarray, (frames, 2)
-        x, y of the star, 0-indexed.
-    shifts : ndarray, (frames, 2)
-        x, y in pixels.
-    is_measured : bool
-        Whether the star's position is compared with its light, unless the file's own records agree
-        with each other.
-
-    Returns
-    -------
-    dict
-        The attributes of the observation that change.
+    `arguments` are those of `read_calints`; their arrays are overwritten. `center`, x, y of the
+    star from 0, and `shifts`, x, y in pixels, are (frames, 2). With `is_measured` the star's
+    position is compared with its light, unless the file's own records agree with each other.
     """
     name, header, frames = arguments["name"], arguments["header"], len(center)
     data, error, usable = (
@@ -693,6 +561,8 @@ def on_detector_pixels(
         else:
             begin = np.array([float(each or 0) - 1 for each in stated])
         mask = mask - begin
+    # Light is `net` from the pixel that it fell on: whole pixels only move the array's place on the
+    # detector, and the rest, net - pixels, is undone.
     net = net_shifts(shifts, center, mask)
     pixels = np.round(net.mean(axis=0))
     # The alignment leaves the flags where they were; a crop takes them along.

@@ -48,23 +48,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Window:
-    """A box in frames that have their star in one place; it may reach beyond their edges.
+    """A box in frames that have their star in one place; it may reach beyond their edges."""
 
-    Attributes
-    ----------
-    y, x : int
-        The box's first row and column in the frame.
-    shape : tuple of int
-        (ny, nx) of the box.
-    """
-
-    y: int
-    x: int
-    shape: tuple[int, int]
+    y: int  # first row in the frame
+    x: int  # first column in the frame
+    shape: tuple[int, int]  # (ny, nx)
 
     @classmethod
     def about(cls, center: NDArray[np.float64], shape: tuple[int, int]) -> Window:
         """Return the box whose middle is within half a pixel of `center`, [x, y]."""
+        # Pixel centres are whole numbers, so that the box from `first` has its middle at first +
+        # (n - 1) / 2.
         ny, nx = shape
         return cls(round(center[1] - (ny - 1) / 2), round(center[0] - (nx - 1) / 2), shape)
 
@@ -146,15 +140,10 @@ def frames_in(
 def means_of_file(
     path: str | os.PathLike[str], *, star: tuple[float, float] | None = None
 ) -> dict[str, Any]:
-    """Read and judge a calints file, and average the integrations of each of its pointings.
+    """Read and judge a calints file: the attributes of the means of each of its pointings.
 
     It takes at most as much memory as the file has, however many integrations there are; see
     `Observation.means_from_fits`.
-
-    Returns
-    -------
-    dict
-        The attributes of the observation.
     """
     with open_fits(path, images=False) as hdus:
         frames, kept, _ = _judged(hdus, path, compact=True, star=star)
@@ -162,19 +151,10 @@ def means_of_file(
 
 
 def means_of_pointings(frames: Mapping[str, Any], which: NDArray[np.intp]) -> dict[str, Any]:
-    """Average the integrations of each pointing.
+    """Average the integrations `which` of each pointing: the attributes of `frames` that change.
 
-    Parameters
-    ----------
-    frames : mapping
-        The attributes of an `Observation` of single integrations.
-    which : ndarray of int
-        Indices of the integrations that are used, at least one.
-
-    Returns
-    -------
-    dict
-        The attributes that change.
+    `frames` are the attributes of an `Observation` of single integrations; `which` are indices, at
+    least one.
     """
     center, angles = frames["center"], frames["position_angles"]
     turns = None if angles is None else angles[which]
@@ -486,6 +466,7 @@ class Observation:
             for key in ("data", "error", "valid", "center", "position_angles")
             if getattr(self, key) is not None
         }
+        # The mean of the integrations: each observation counts by the number that it has.
         offsets = [each.star_offset for each in every if each.star_offset is not None]
         if len(offsets) == len(every):
             x, y = np.average(offsets, axis=0, weights=[each.count for each in every])
@@ -677,6 +658,7 @@ class Observation:
             pairs = zip(windows, stack, strict=True)
             return np.concatenate([window.cut(frame[None], fill) for window, frame in pairs])
 
+        # Frames that are cut at different pixels have no first pixel on the detector in common.
         corners = np.array([(window.x, window.y) for window in windows])
         origin = None
         if self.first_pixel is not None and (corners == corners[0]).all():

@@ -122,18 +122,7 @@ _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 def why_no_star(observation: Observation) -> str:
     """Why these cannot be frames of a star behind the mask; empty if they can.
 
-    The diffraction pattern of a star is nearly symmetric about the star, see
-    `pyklip_diffrender.scene.star_place`. Where another source is so bright that the centre of
-    all light is elsewhere, the pattern about the star's position decides, in which a point source
-    is a small part. Where the source hides that, too, it is compared with the model's image of a
-    point source. What does not look like one is a star's pattern in the wrong place. A source
-    next to which there is less light behind the mask than that of a star ten times as bright is
-    the star itself, off the mask.
-
-    Parameters
-    ----------
-    observation : Observation
-        Frames that are too small (1.2 arcsec about the star) are not judged.
+    Frames that are too small (1.2 arcsec about the star) are not judged.
     """
     stamp = _stamp(observation)
     if stamp is None:
@@ -155,6 +144,12 @@ def why_no_star(observation: Observation) -> str:
             "remain): the star was subtracted, or the background was subtracted with a neighbour "
             f"in it. Use frames before the subtraction (calints). {_INSIST}"
         )
+    # The diffraction pattern of a star is nearly symmetric about the star. Where another source is
+    # so bright that the centre of all light is elsewhere, the pattern about the star's position
+    # decides, in which a point source is a small part. Where the source hides that, too, it is
+    # compared with the model's image of a point source. What does not look like one is a star's
+    # pattern in the wrong place. A source next to which there is less light behind the mask than
+    # that of a star ten times as bright is the star itself, off the mask.
     scale = observation.pixelscale
     away = center_of_symmetry(light) * scale
     if np.hypot(*away) <= _BEHIND:
@@ -199,6 +194,8 @@ def _contrast_of_source(observation: Observation) -> float:
     peak = _peak(np.where(outside, gaussian_filter(image, 1.0), -np.inf))
     if _likeness(image, peak, source, _peak(source), scale) < _LIKE_A_SOURCE:
         return np.inf
+    # A point source is symmetric about its peak, other light need not be: the smaller one of two
+    # opposite pixels has what the source may account for.
     mirrored = map_coordinates(
         image, [2 * peak[1] - rows, 2 * peak[0] - columns], order=1, mode="constant"
     )
@@ -206,6 +203,8 @@ def _contrast_of_source(observation: Observation) -> float:
     # What may be light of the star: the model of the source's wings is not perfect.
     left = uniform_filter(image - _SYMMETRIC * symmetric, 3)
     behind = np.hypot(columns - x, rows - y) * scale < _BEHIND / 2
+    # Fluxes in units of the model's star: at most `most` for the star behind the mask, `flux` for
+    # the source outside it.
     most = max(float(left[behind].max()), 0.0) / float(uniform_filter(star, 3).max())
     own = float(uniform_filter(image, 3)[tuple(np.round(peak[::-1]).astype(int))])
     flux = own / float(uniform_filter(source, 3).max())
@@ -229,6 +228,8 @@ def _peak(image: Image) -> Image:
     row, column = np.unravel_index(int(image.argmax()), image.shape)
     place = np.array([column, row], dtype=float)
     for axis, (values, k) in enumerate(((image[row], column), (image[:, column], row))):
+        # The parabola through three neighbours l, m, h has its vertex (l - h) / 2 (l - 2 m + h)
+        # from the middle one.
         if 0 < k < len(values) - 1 and np.isfinite(values[k - 1 : k + 2]).all():
             low, middle, high = values[k - 1 : k + 2]
             curvature = low - 2 * middle + high
@@ -251,14 +252,12 @@ def _likeness(image: Image, place: Image, other: Image, there: Image, scale: flo
 
 
 def brightness(observation: Observation) -> float:
-    """Light within 1 arcsec of the star, in the frames' unit; NaN for frames that are too small.
-
-    The edge is soft and moves with the star by fractions of a pixel, so that a neighbour on it
-    counts alike in all rolls.
-    """
+    """Light within 1 arcsec of the star, in the frames' unit; NaN for frames that are too small."""
     stamp = _stamp(observation)
     if stamp is None:
         return np.nan
+    # The edge is soft and moves with the star by fractions of a pixel, so that a neighbour on it
+    # counts alike in all rolls.
     image = stamp[0]
     center = observation.mean_center
     x, y = center - np.round(center)
@@ -268,17 +267,10 @@ def brightness(observation: Observation) -> float:
 
 
 def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
-    """Find frames of a star that are much brighter or fainter than the others.
+    """Find frames of a star, in one set-up, that are much brighter or fainter than the others.
 
-    Parameters
-    ----------
-    observations : sequence of Observation
-        Of one star and set-up.
-
-    Returns
-    -------
-    dict of int to str
-        Reason by index. Where half of the frames or more have one, nothing says which are right.
+    The result has reasons by index. Where half of the frames or more have one, nothing says which
+    are right.
     """
     light = np.array([brightness(each) for each in observations])
     known = np.flatnonzero(np.isfinite(light) & (light > 0))
@@ -299,21 +291,14 @@ def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
 
 
 def why_turned(observations: Sequence[Observation]) -> dict[int, str]:
-    """Find frames whose pixels are mirrored or turned, unlike those of most others.
+    """Find frames of one set-up whose pixels are mirrored or turned, unlike those of most others.
 
-    The telescope, and with it the star's diffraction pattern, has one orientation on the detector.
-
-    Parameters
-    ----------
-    observations : sequence of Observation
-        Of one set-up. Frames that are too small, or that show another source as bright as the star
-        behind the mask, which turns with the sky, are not compared.
-
-    Returns
-    -------
-    dict of int to str
-        Reason by index. Where half of the frames or more have one, nothing says which are right.
+    The result has reasons by index. Where half of the frames or more have one, nothing says which
+    are right. Frames that are too small, or that show another source as bright as the star behind
+    the mask, which turns with the sky, are not compared.
     """
+    # The telescope, and with it the star's diffraction pattern, has one orientation on the
+    # detector.
     patterns = {k: each for k, each in enumerate(map(_pattern, observations)) if each is not None}
     different: dict[int, list[str]] = {k: [] for k in patterns}
     for k, pattern in patterns.items():
@@ -367,16 +352,13 @@ def _turn(pattern: Image, other: Image) -> str:
 def why_odd_unit(observation: Observation) -> str:
     """Why frames cannot be in the unit that they state; empty if they can.
 
-    Parameters
-    ----------
-    observation : Observation
-        Only frames in MJy/sr with 2000 pixels far from the star are judged.
+    Only frames in MJy/sr with 2000 pixels far from the star are judged.
     """
     difference, usable = _noise(observation, clipped=False)
     if usable.sum() < _ENOUGH or observation.unit != u.MJy / u.sr:
         return ""
     dark = dark_pixels(_mean(observation)[0], usable)
-    # A pixel less the mean of four.
+    # A pixel less the mean of four has the variance 1 + 1/4.
     scatter = float(median_abs_deviation(difference[dark], scale="normal")) / 1.25**0.5
     low, high = _SCATTER
     if low < scatter < high:
@@ -389,17 +371,13 @@ def why_odd_unit(observation: Observation) -> str:
 
 
 def copies(observations: Sequence[Observation]) -> dict[int, int]:
-    """Find observations that show the same pixels as an earlier one, whatever their headers say.
+    """Find observations with the pixels of an earlier one: index of the copy, and of the other.
 
-    Pixels far from the star are compared, so that copies in another unit, or with a few other
-    pixels, are seen as such. Exposures of one bright field are alike, too, but differ by their
-    noise. Frames with fewer than 2000 pixels far from the star are not compared.
-
-    Returns
-    -------
-    dict of int to int
-        Index of the copy, and of what it is a copy of.
+    Frames with fewer than 2000 pixels far from the star are not compared.
     """
+    # Pixels far from the star are compared, whatever the headers say, so that copies in another
+    # unit, or with a few other pixels, are seen as such. Exposures of one bright field are alike,
+    # too, but differ by their noise.
     noise = [_noise(each) for each in observations]
     result: dict[int, int] = {}
     for k, (values, usable) in enumerate(noise):
@@ -425,6 +403,7 @@ def _differ_by_noise(
     (data, error, _), (others, _, _) = _mean(observation), _mean(other)
     rough = [each - convolve(each, _NEIGHBOURS, mode="nearest") for each in (data, others)]
     mine, theirs = (each[usable] for each in rough)
+    # The factor a, of another unit, that makes sum of (mine - a theirs)^2 minimal.
     factor = float((mine * theirs).sum() / (theirs**2).sum())
     # Of two exposures the noise of the difference is 1.6 times the error of one.
     return float(np.median(np.abs(mine - factor * theirs) / error[usable])) > _SAME_NOISE

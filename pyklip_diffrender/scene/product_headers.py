@@ -44,16 +44,10 @@ _REDUCED = {
 def primary_hdu(
     observation: Observation, provenance: Mapping[str, Any], mjd: float | None = None
 ) -> fits.PrimaryHDU:
-    """Make a primary HDU without data.
+    """Make a primary HDU without data, with cards of the first frame, `observation`.
 
-    Parameters
-    ----------
-    observation : Observation
-        The first frame.
-    provenance : mapping
-        Its known entries become DR keywords, its observations lines of HISTORY.
-    mjd : float, optional
-        Mean of the mid-exposures, UTC.
+    Known entries of `provenance` become DR keywords, its observations lines of HISTORY; `mjd` is
+    the mean of the mid-exposures, UTC.
     """
     hdu = fits.PrimaryHDU()
     header = hdu.header
@@ -76,17 +70,10 @@ def primary_hdu(
 
 
 def world_coordinates(grid: NDArray[np.float64], observation: Observation) -> fits.Header:
-    """Cards of a WCS for the pixels of a frame.
+    """WCS of the pixels of a frame; `grid`, (ny, nx, 2), is x, y from the star in arcsec.
 
     The star is at the reference coordinates of the frame (CRVAL), where the telescope pointed. If
     these or the orientation are not known, the coordinates are x, y from the star in arcsec.
-
-    Parameters
-    ----------
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-    observation : Observation
-        Of that frame.
     """
     columns, rows = grid.shape[1] - 1, grid.shape[0] - 1
     steps = np.diag(observation.pixelscale)
@@ -101,6 +88,8 @@ def world_coordinates(grid: NDArray[np.float64], observation: Observation) -> fi
         isinstance(each, float) and math.isfinite(each) for each in pointing
     ):
         axes, unit, values = ("RA---TAN", "DEC--TAN"), "deg", (pointing[0], pointing[1])
+        # With +y at the angle p east of north, and +x to the west where p is 0: east = -x cos p + y
+        # sin p, north = x sin p + y cos p.
         angle = np.deg2rad(observation.position_angle)
         sine, cosine = np.sin(angle), np.cos(angle)
         steps = np.array([[-cosine, sine], [sine, cosine]]) @ steps / 3600
@@ -129,17 +118,7 @@ def ccd_data(
 ) -> CCDData:
     """Make astropy's `CCDData` of an image, (ny, nx), masked where it is not valid or not finite.
 
-    Parameters
-    ----------
-    image : ndarray, (ny, nx)
-    error : ndarray, (ny, nx), or None
-        Standard deviations.
-    unit : Unit
-    wcs : Header
-        See `world_coordinates`.
-    valid : ndarray of bool, (ny, nx), optional
-    **meta
-        Entries of the attribute `meta`.
+    `error` are standard deviations, (ny, nx); `meta` are entries of the attribute of that name.
     """
     mask = ~np.isfinite(image)
     uncertainty = None

@@ -48,27 +48,13 @@ SHORT = ("use", "star", "date", "position_angle", "integrations", "file")
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A file in the table of a sequence.
-
-    Attributes
-    ----------
-    use : "target", "reference" or "excluded"
-    star : str
-    exposure : Exposure
-        Facts from the header.
-    observation : Observation or None
-        The frames, unless they are excluded.
-    remark : str
-        Why the file is excluded, or what of it was left out.
-    path : Path or None
-        Of the file, where there is one.
-    """
+    """A file in the table of a sequence."""
 
     use: Literal["target", "reference", "excluded"]
     star: str
     exposure: Exposure
-    observation: Observation | None = None
-    remark: str = ""
+    observation: Observation | None = None  # the frames, unless they are excluded
+    remark: str = ""  # why the file is excluded, or what of it was left out
     path: Path | None = None
 
     @property
@@ -324,6 +310,9 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
+        # Stars are told apart on copies of the files, because the reasons that this fills in hold
+        # for one filter alone. Where there are several filters, frames are judged first, so that
+        # none is there only by frames that are excluded.
         listed = _usable(files, references, star, target)
         if filter is not None:
             return cls._by_epoch(listed, target, filter)
@@ -395,6 +384,7 @@ class Sequence:
             for part in () if observation is None else observation.pointings():
                 part = replace(part, reference=use == "reference")
                 used[use].append(part)
+                # Segments are files of one exposure, which has no number of a segment in its name.
                 exposures[part.name] = re.sub(r"-seg\d+", "", each.exposure.identity or part.name)
                 remark = "; ".join(part.remarks)
                 rows.append(Row(use, each.star, each.exposure, part, remark, each.path))
@@ -443,6 +433,7 @@ class Sequence:
         for k, place in enumerate(places):
             if first is None or place is None:
                 continue
+            # How far the first pixel of the first window on the detector is from that of this one.
             x, y = first - place
             if max(abs(x), abs(y)) <= _NEARLY_THE_SAME:
                 windows[k] = Window(windows[k].y + int(y), windows[k].x + int(x), shape)

@@ -62,19 +62,14 @@ def faintness(observation: Observation) -> float:
     ring = frame.valid[0] & (away > _RING[0]) & (away < _RING[1])
     if not ring.any():
         return 1.0
+    # The chi-squared of an error of the model that is a fraction of the light is proportional to
+    # (S/N)^2.
     squares = (frame.data[0][ring] / frame.error[0][ring]) ** 2
     return _REFERENCE / max(float(np.median(squares)), 1e-6)
 
 
 def coarse_arguments(observation: Observation, size: int) -> dict[str, Any]:
-    """Arguments of `model_for` for a first look, by the noise of the frames.
-
-    Parameters
-    ----------
-    observation : Observation
-    size : int
-        Side of the pixels on which the model is evaluated.
-    """
+    """Arguments of `model_for`, by the noise, for a first look at `size` x `size` pixels."""
     nlambda = 3 if faintness(observation) >= _VERY_FAINT else 5
     if observation.filter is None:
         return {}
@@ -169,6 +164,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             )
         shortest = float(filter_throughput(observation.filter)[0][0])
         (ny, nx), (x, y) = observation.shape, place.siaf_pixelscale
+        # Powers of two times the default, until the image of the sampled pupil does not repeat in
+        # the field.
         npix = _NPIX
         while npix < samples_for_field(max(nx * x, ny * y, place.period()), shortest):
             npix *= 2
@@ -262,6 +259,7 @@ def simulate(
     generator = np.random.default_rng(seed)
     counts = generator.poisson(expected, size=(frames, *expected.shape)).astype(np.float64)
     counts += generator.normal(0.0, scene.read_noise, size=counts.shape)
+    # As an observer would: the variance of the counts is estimated by the counts themselves.
     error = np.sqrt(np.maximum(counts, 0.0) + scene.read_noise**2)
     return Observation.from_arrays(
         counts,

@@ -57,22 +57,11 @@ another source."""
 def stamp_about(
     data: Image, error: Image, valid: NDArray[np.bool_], center: Image, pixelscale: float
 ) -> tuple[Image, Image, Image] | None:
-    """Cut the square about a star out of an image, without the background.
+    """Cut the square (n, n) about a star out of an image (ny, nx), without the background.
 
-    Parameters
-    ----------
-    data, error : ndarray, (ny, nx)
-    valid : ndarray of bool, (ny, nx)
-    center : ndarray, (2,)
-        x, y of the star.
-    pixelscale : float
-        arcsec.
-
-    Returns
-    -------
-    image, distance, noise : ndarray, (n, n), or None
-        n is odd; distances from the middle in arcsec. None for images that reach less than 1.2
-        arcsec from the star.
+    `center` is x, y of the star, (2,), `pixelscale` in arcsec. The result has the image, the
+    distances from its middle in arcsec, and the noise; n is odd. None for images that reach less
+    than 1.2 arcsec from the star.
     """
     x, y = np.round(center).astype(int)
     ny, nx = data.shape
@@ -97,28 +86,13 @@ def stamp_about(
 
 
 def center_of_symmetry(image: Image) -> Image:
-    """Find the point about which an image is most symmetric.
+    """x, y from the middle, (2,), in pixels, of the point about which an image is most symmetric.
 
-    It is where the convolution of the image with itself is largest.
-
-    Parameters
-    ----------
-    image : ndarray, (n, n)
-        n is odd; negative pixels count as 0.
-
-    Returns
-    -------
-    ndarray, (2,)
-        x, y from the middle, to a tenth of a pixel for stars on real frames.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> image = np.zeros((9, 9))
-    >>> image[5, 1:4] = 1.0
-    >>> center_of_symmetry(image)
-    array([-2.,  1.])
+    The image is (n, n) with n odd; negative pixels count as 0. It is good to a tenth of a pixel for
+    stars on real frames.
     """
+    # The convolution of the image with itself at 2 c, sum over x of f(x) f(2 c - x), compares it
+    # with itself turned by 180 degrees about c; it is largest where these are most alike.
     # Zeros around the image, so that the convolution is not periodic.
     size = 2 * len(image)
     transform = np.fft.rfft2(np.maximum(image, 0.0), (size, size))
@@ -137,46 +111,22 @@ def _vertex(values: Image, peak: int) -> float:
 
 
 def center_of_pattern(image: Image, distance: Image) -> Image:
-    """Find the centre of a star's diffraction pattern where another source may outshine it.
+    """x, y from the middle, (2,), in pixels, of a star's pattern that another source may outshine.
 
-    Square roots, within 1.2 arcsec of the middle, are compared: a point source is then a small
-    part of the light, and the star's pattern, which fills the field, most of it.
-
-    Parameters
-    ----------
-    image, distance : ndarray, (n, n)
-        See `stamp_about`; pixels without a signal are 0.
-
-    Returns
-    -------
-    ndarray, (2,)
-        x, y from the middle, pixels.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> rows, columns = np.indices((31, 31)) - 15
-    >>> distance = 0.06 * np.hypot(rows, columns)
-    >>> image = np.exp(-((distance / 0.6) ** 2))
-    >>> image[20, 24] += 30
-    >>> print(np.abs(center_of_symmetry(image)).max(), center_of_pattern(image, distance).round(1))
-    9.0 [0. 0.]
+    `image` and `distance` are (n, n), see `stamp_about`; pixels without a signal are 0.
     """
+    # Square roots, within 1.2 arcsec of the middle: a point source is then a small part of the
+    # light, and the star's pattern, which fills the field, most of it.
     return center_of_symmetry(np.sqrt(np.maximum(np.where(distance < _PATTERN, image, 0.0), 0.0)))
 
 
 def measured_offset(
     data: Image, error: Image, valid: NDArray[np.bool_], center: Image, pixelscale: float
 ) -> Image | None:
-    """How far a star is from where it is said to be, x, y in pixels.
+    """How far a star is from where it is said to be, x, y in pixels, (2,); see `stamp_about`.
 
-    The arguments are those of `stamp_about`.
-
-    Returns
-    -------
-    ndarray, (2,), or None
-        None if the image is too small, is not that of a star, or is also that of another source
-        whose light cannot be told from the star's.
+    None if the image is too small, is not that of a star, or is also that of another source whose
+    light cannot be told from the star's.
     """
     stamp = stamp_about(data, error, valid, center, pixelscale)
     if stamp is None:
@@ -197,28 +147,17 @@ def measured_offset(
     about = np.hypot(columns - away[0], rows - away[1]) * pixelscale
     if np.hypot(*(center_of_pattern(bright, about) - away)) * pixelscale > _AGREE:
         return None
+    # `stamp_about` has the nearest whole pixel in its middle.
     return np.asarray(np.round(center) + away - center)
 
 
 def local_maxima(
     image: NDArray[np.float64], allowed: NDArray[np.bool_], threshold: float, *, size: int
 ) -> list[tuple[int, int]]:
-    """Find pixels above a threshold that are the maximum of the square around them.
+    """Row and column of the `allowed` pixels above a threshold that are the maximum of a square.
 
-    Parameters
-    ----------
-    image : ndarray, (ny, nx)
-        NaN where unknown.
-    allowed : ndarray of bool, (ny, nx)
-        Where maxima are accepted.
-    threshold : float
-    size : int
-        Side of the square, pixels.
-
-    Returns
-    -------
-    list of (row, column)
-        Highest first.
+    `image` is (ny, nx), NaN where unknown; the square about a pixel has the side `size`. The
+    highest maximum is first.
     """
     filled = np.where(np.isnan(image), -math.inf, image)
     peaks = (filled == maximum_filter(filled, size=size)) & allowed & (filled > threshold)

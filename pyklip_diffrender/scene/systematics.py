@@ -29,15 +29,9 @@ def pattern_hdus(
 ) -> list[fits.ImageHDU]:
     """Return the FITS extensions PATTERN and PATTERN_ERROR of one of the patterns of a file.
 
-    Parameters
-    ----------
-    pattern, error : ndarray, (ny, nx)
-        NaN errors where nothing was measured.
-    source : object
-        With the attributes `center`, `pedestal`, `first_pixel`, `filter` and `image_mask` of
-        `Systematics`.
-    version : int
-        Number of the pattern in the file.
+    `pattern` and `error` are (ny, nx), NaN errors where nothing was measured; `source` has the
+    attributes of `Systematics` that go into the header; `version` is the pattern's number in the
+    file.
     """
     hdus = [
         fits.ImageHDU(pattern, name="PATTERN", ver=version),

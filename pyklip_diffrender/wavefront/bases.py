@@ -116,6 +116,8 @@ def _sampled_segment(outline: Tensor, grid: PupilGrid) -> tuple[PupilGrid, Tenso
     area = cover.sum()
     modes = [cover]
     for axis in (window.x[None, :], window.y[:, None]):
+        # Without its mean over the segment, and with an rms of 1 on it, so that a coefficient is in
+        # m rms.
         ramp = axis - (cover * axis).sum() / area
         rms = torch.sqrt((cover * ramp**2).sum() / area)
         modes.append(cover * ramp / rms)
@@ -123,16 +125,7 @@ def _sampled_segment(outline: Tensor, grid: PupilGrid) -> tuple[PupilGrid, Tenso
 
 
 class FourierModes:
-    """Cosines and sines with whole cycles across the pupil array, up to `max_cycles`.
-
-    Parameters
-    ----------
-    max_cycles : float
-        Highest radial frequency. MASKRND's narrow openings spread light over 11 lambda/D, so a
-        field of 5 arcsec at 4.5 um is sensitive to frequencies up to about 24.
-    min_cycles : float
-        Lowest radial frequency.
-    """
+    """Cosines and sines with whole cycles across the pupil array, up to `max_cycles` radially."""
 
     groups = ("texture",)
 
@@ -140,8 +133,11 @@ class FourierModes:
     """Of the cosines and sines, whose rms is 1."""
 
     def __init__(self, max_cycles: float = 24.0, min_cycles: float = 0.5) -> None:
+        # MASKRND's narrow openings spread light over 11 lambda/D, so a field of 5 arcsec at 4.5 um
+        # is sensitive to frequencies up to about 24.
         self.max_cycles, self.min_cycles = float(max_cycles), float(min_cycles)
         reach = math.floor(max_cycles)
+        # One of each two opposite frequencies, whose cosine and sine are the same but for a sign.
         pairs = [
             (fx, fy)
             for fy in range(reach + 1)
@@ -244,18 +240,10 @@ def fourier_part(basis: Basis) -> tuple[int, FourierModes] | None:
 
 
 def default_basis(max_cycles: float = 24.0, pupil: EntrancePupil | None = None) -> Basis:
-    """Return the wavefront modes of a fit that was not given any.
+    """Return the wavefront modes, up to `max_cycles` across the pupil, of a fit without any given.
 
-    For JWST they are segment motions and Fourier modes, 1,846 modes up to 24 cycles. Other
-    telescopes get the Fourier modes alone, whatever their segments are.
-
-    Parameters
-    ----------
-    max_cycles : float
-        Highest spatial frequency, cycles across the pupil.
-    pupil : EntrancePupil, optional
-        Pupil of the telescope; default that of JWST. It is JWST's if its aperture is, see
-        `is_jwst_pupil`.
+    For JWST, the default, they are segment motions and Fourier modes, 1,846 modes up to 24 cycles.
+    Other telescopes (see `is_jwst_pupil`) get the Fourier modes alone, whatever their segments are.
     """
     fourier = FourierModes(max_cycles)
     if pupil is None or is_jwst_pupil(pupil.lit, pupil.full.diameter):

@@ -151,10 +151,7 @@ def read_opd(
 def as_opd_map(opd: Any) -> OPDMap:
     """Make an `OPDMap` of a path, Quantity, array, tensor, map or "flat"; bare numbers are metres.
 
-    Raises
-    ------
-    UnitError, ShapeError, NonFiniteError, CorruptFileError
-        As `read_opd`.
+    Raises what `read_opd` raises.
     """
     if isinstance(opd, OPDMap):
         return opd
@@ -266,24 +263,10 @@ def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
 
 
 def random_drift(seed: int, hours: float, npix: int = 1024) -> OPDMap:
-    """Draw a change of the wavefront that grows linearly in time.
-
-    Its rms is 9 nm after 86 hours; the published pair of maps differs by 9.06 nm. Segment motions
-    carry 62 % of the variance (as in the change from 2022-08-11 to 08-14), low and mid frequencies
-    the rest.
-
-    Parameters
-    ----------
-    seed : int
-    hours : float or Quantity
-        Time since the wavefront was sensed, h.
-    npix : int
-        Samples across the pupil.
-
-    Returns
-    -------
-    OPDMap
-    """
+    """Draw a change of the wavefront that grows linearly with `hours`, h or a Quantity."""
+    # 9 nm rms after 86 hours, because the published pair of maps differs by 9.06 nm. Segment
+    # motions carry 62 % of the variance (as in the change from 2022-08-11 to 08-14), low and mid
+    # frequencies the rest.
     hours = to_number(hours, u.h, "hours")
     unit = _random(seed, npix, 1e-8, 0.62, "random_drift")
     data = unit.data * (9e-9 / 1e-8 * hours / 86.0)
@@ -306,6 +289,7 @@ def _random(seed: int, npix: int, rms: float, segment_variance: float, name: str
         opd = opd - (weight * opd).sum()
         return opd / torch.sqrt((weight * opd**2).sum())
 
+    # Both have the variance 1, so that the squares of the factors are their shares of the sum's.
     rigid, inner = (normalised(part) for part in parts)
     mixed = math.sqrt(segment_variance) * rigid + math.sqrt(1 - segment_variance) * inner
     data = (rms * normalised(mixed) * (pupil > 0)).numpy()
@@ -423,17 +407,8 @@ def _last_analyses(
 def wavefront_for(opd: Any, date: Time | None) -> OPDMap:
     """The wavefront for frames of a date: as `as_opd_map`, or the nearest map in a folder.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For a folder, if the date of the frames is not known.
-    DiffrenderError
-        See `choose_map` and `read_opd`.
-
-    Warns
-    -----
-    DiffrenderWarning
-        If the map is more than 200 days from the date.
+    Raises what `choose_map` and `read_opd` raise, and IncompatibleSetupError for a folder if the
+    date of the frames is not known; warns if the map is more than 200 days from the date.
     """
     if isinstance(opd, str | os.PathLike) and opd != FLAT and Path(opd).is_dir():
         if date is None:

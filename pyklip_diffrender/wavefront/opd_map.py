@@ -102,28 +102,12 @@ _TURNS: dict[str, Any] = {
 
 
 def check_opd(opd: Array, amplitude: Array, name: str) -> None:
-    """Check the size of a map's values and the position of its blank samples.
+    """Check the size of a map's values (m) and the position of its blank samples.
 
-    Parameters
-    ----------
-    opd : ndarray, (npix, npix)
-        m.
-    amplitude : ndarray, (npix, npix)
-        Transmission of the pupil in the orientation that the map should have.
-    name : str
-        Name of the map, for messages.
-
-    Raises
-    ------
-    NonFiniteError
-        If a value inside the pupil is not finite.
-    UnitError
-        If the values are too large to be in metres.
-
-    Warns
-    -----
-    DiffrenderWarning
-        If the blank samples match the pupil better after a flip or a rotation by 180 degrees.
+    Both arrays are (npix, npix); `amplitude` is the pupil's in the orientation that the map should
+    have. NonFiniteError if a value inside the pupil is not finite, UnitError if the values are too
+    large to be in metres; a warning if the blank samples match the pupil better after a flip or a
+    rotation by 180 degrees.
     """
     inside = amplitude > 0
     require_finite(opd, name, inside)
@@ -150,17 +134,9 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
 
 
 def opd_to_hdus(opd: Any) -> fits.HDUList:
-    """An OPD as an HDUList that poppy and stpsf read, for ``nircam.pupilopd`` or a file.
+    """An OPD (npix, npix), in m, as an HDUList that poppy and stpsf read, for ``nircam.pupilopd``.
 
-    Parameters
-    ----------
-    opd : OPDMap, Tensor, Quantity or array, (npix, npix)
-        Bare numbers are metres. The header records the origin of an `OPDMap`.
-
-    Returns
-    -------
-    HDUList
-        One image in metres, with BUNIT and PUPLSCAL.
+    The header has BUNIT, PUPLSCAL, and the origin of an `OPDMap`.
     """
     values = to_metres(opd, "opd")
     header = fits.Header()

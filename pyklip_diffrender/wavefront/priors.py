@@ -142,27 +142,15 @@ class WavefrontPrior:
 
 @dataclass(frozen=True)
 class EvidenceUpdate:
-    """The solution of a linearised problem.
+    """The solution of a linearised problem."""
 
-    Attributes
-    ----------
-    step : Tensor, (parameters,)
-        Most probable values.
-    variance : Tensor, (parameters,), or None if it was not asked for
-        Diagonal of the covariance.
-    scales : Tensor, (groups,)
-    effective : float
-        Number of unknowns that the data determine: the sum of 1 minus the ratio of posterior and
-        prior variance (with the scales before the last update, where no errors were asked for).
-    log_evidence : float
-        Up to a constant that does not depend on the scales.
-    """
-
-    step: Tensor
-    variance: Tensor | None
-    scales: Tensor
+    step: Tensor  # (parameters,), most probable values
+    variance: Tensor | None  # (parameters,), if it was asked for
+    scales: Tensor  # (groups,)
+    # Number of unknowns that the data determine: the sum of 1 minus the ratio of posterior and
+    # prior variance (with the scales before the last update, where no errors were asked for).
     effective: float
-    log_evidence: float
+    log_evidence: float  # up to a constant that does not depend on the scales
 
     def in_units(self, unit: Tensor) -> EvidenceUpdate:
         """Return the prior in other units, of which `unit` make up one old unit, (parameters,)."""
@@ -224,6 +212,8 @@ def learn_prior(
     coefficients = torch.linalg.solve(system, right).square().mean(dim=1).sqrt().numpy()
     frequency, group = basis.frequencies.numpy(), basis.group_index.numpy()
 
+    # A coefficient c with the deviation s has -log p = log s + c^2 / 2 s^2, up to a constant; s is
+    # the scale of its group over 1 + (frequency / knee)^slope.
     def deviations(logs: NDArray[np.float64]) -> NDArray[np.float64]:
         scales, knee, slope = np.exp(logs[:-2]), np.exp(logs[-2]), np.exp(logs[-1])
         return np.asarray(scales[group] / (1 + (frequency / knee) ** slope))
@@ -271,29 +261,24 @@ def solve_with_evidence(
 ) -> EvidenceUpdate:
     """Solve a whitened linear least-squares problem with Gaussian priors about zero.
 
-    Parameters
-    ----------
-    curvature : Tensor, (n, n)
-        G^T G of the whitened Jacobian, float64; the wavefront modes last.
-    gradient : Tensor, (n,)
-        G^T of the whitened residual at zero.
-    shape : Tensor, (modes,)
-        Relative prior deviation of the modes.
-    group : Tensor, (modes,), int64
-        Group of every mode.
-    scales : Tensor, (groups,)
-        Starting scales.
-    fixed_deviation : Tensor, (n - modes,)
-        Prior deviation of the parameters before the modes; inf without a prior.
-    iterations : int
-        Updates of the scales; 0 keeps them.
-    damping : float
-        Levenberg-Marquardt damping of steps from `current`, as a multiple of the prior's penalty.
-    current : Tensor, (n,), optional
-        Present values of the parameters.
-    errors : bool
-        Also compute the variances.
+    `curvature` is G^T G of the whitened Jacobian, (n, n), float64, the wavefront modes last, and
+    `gradient` G^T of the whitened residual at zero, (n,). `shape` and `group` are the relative
+    prior deviation and the group of every mode, `scales` the starting scales of the groups, and
+    `fixed_deviation`, (n - modes,), those of the parameters before the modes, inf without a prior.
+    `iterations` is the number of updates of the scales; `damping` that of steps from `current`,
+    (n,), as a multiple of the prior's penalty.
     """
+    # With the prior's precision P and the damping d of steps from x0 (Levenberg-Marquardt), the
+    # step x minimises |r - G x|^2 + x P x + d (x - x0) P (x - x0):
+    #
+    #     A x = G^T r + d P x0,    A = G^T G + (1 + d) P.
+    #
+    # With the variances V = diag A^-1, the data determine the share 1 - P V of every unknown. The
+    # evidence is stationary in the scale s of a group where s^2 times the sum of the shares is the
+    # sum of (x / shape)^2 over its modes (MacKay 1992, above); that is iterated. Without damping
+    # its logarithm is, up to a constant,
+    #
+    #     x (G^T r) / 2 - log det A / 2 + log det P / 2.
     others = len(fixed_deviation)
     effective = float("nan")
     for k in range(iterations + 1):
@@ -307,6 +292,7 @@ def solve_with_evidence(
         step = torch.cholesky_solve(pulled[:, None], factor)[:, 0]
         if k == iterations and not errors:
             break
+        # A = L L^T, so that diag A^-1 is the sum of the squares in each column of L^-1.
         variance = _inverse_of_lower(factor).square_().sum(dim=0)
         # Share of every unknown that the data determine, and the scale of the modes of each group.
         share = 1 - precision * variance
@@ -326,22 +312,13 @@ def solve_with_evidence(
 
 
 def scale_ratios(step: Tensor, variance: Tensor, deviation: Tensor, group: Tensor) -> Tensor:
-    """Size of the modes of each group relative to their prior.
+    """Size of the modes of each group relative to their prior, (groups,).
 
-    At the scales of the highest evidence, the sum of (step / deviation)^2 is the number of modes
-    that the data determine.
-
-    Parameters
-    ----------
-    step, variance, deviation : Tensor, (modes,)
-        Most probable values, their variance, and the prior's standard deviation.
-    group : Tensor, (modes,), int64
-
-    Returns
-    -------
-    Tensor, (groups,)
-        Above 1 for a prior that is too narrow; 1 for groups with too few determined modes.
+    Most probable values, their variance and the prior's deviation are (modes,), as is `group`.
+    Above 1 for a prior that is too narrow; 1 for groups with too few determined modes.
     """
+    # At the scales of the highest evidence, the sum of (step / deviation)^2 is the number of modes
+    # that the data determine.
     count = int(group.max()) + 1
     determined = torch.zeros(count, dtype=step.dtype)
     determined.index_add_(0, group, 1 - variance / deviation**2)

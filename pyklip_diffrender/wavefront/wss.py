@@ -169,14 +169,7 @@ _WINDOWS = (3.0, 6.0, 12.0)
 
 
 def analysis_of(name: str) -> tuple[str, int]:
-    """Key by which the analyses of one sensing are sorted, the last one at the end.
-
-    Examples
-    --------
-    >>> names = ["R2022081102-NRCA3_FP1-2.fits", "R2022081102-NRCA3_FP1-10.fits.gz"]
-    >>> max(names, key=analysis_of)
-    'R2022081102-NRCA3_FP1-10.fits.gz'
-    """
+    """Key by which the analyses of one sensing are sorted, the last one at the end."""
     match = _NAME.search(name)
     # The letter says who asked for the correction; its number counts the day's.
     return (name, 0) if match is None else (match[1][1:], int(match[2]))
@@ -185,14 +178,8 @@ def analysis_of(name: str) -> tuple[str, int]:
 def why_not_sensed_well(correction: str, observation: str) -> str:
     """Why a measurement is not used where there are others; empty for those that are.
 
-    These are the ones that stpsf leaves out of its tables of wavefronts, too.
-
-    Parameters
-    ----------
-    correction : str
-        Such as "R2022083106" (CORR_ID).
-    observation : str
-        The identifier of the exposure (OBS_ID), which ends in the activity.
+    `correction` is such as "R2022083106" (CORR_ID), `observation` the identifier of the exposure
+    (OBS_ID), which ends in the activity. stpsf leaves the same ones out of its tables.
     """
     if correction in _INVALID:
         return f"the analysis {correction} has known faults"
@@ -390,17 +377,9 @@ def _names_in_archive(mast_wss: Any, when: Time, choice: str) -> list[str]:
 
 
 def interpolate_wss(before: OPDMap, after: OPDMap, date: str | Time) -> OPDMap:
-    """Interpolate linearly in time between two maps.
+    """Interpolate linearly in time between two maps, with a warning: it was not measured.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        If a map has no date, or the date is not between theirs.
-
-    Warns
-    -----
-    DiffrenderWarning
-        Always: this wavefront was not measured, and segments move in steps.
+    IncompatibleSetupError if a map has no date, or the date is not between theirs.
     """
     when = Time(date)
     if before.date is None or after.date is None:
