@@ -840,8 +840,7 @@ def frames_of(
 def _gather(
     dataset: Any, index: NDArray[np.intp], imgs: NDArray[Any], settings: DiffrenderSettings
 ) -> Frames:
-    """Gather all frames of one wavelength, of whatever star; warns if their files cannot be used.
-    """
+    """Gather all frames of one wavelength, of whatever star; warns if the files are of no use."""
     imgs = native_float64(imgs)
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
     data, valid, error = imgs, np.isfinite(imgs), None

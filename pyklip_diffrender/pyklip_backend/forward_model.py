@@ -229,8 +229,7 @@ def _change_of_star(
     sources: Sequence[_PlanetImage],
     factors: Sequence[float],
 ) -> list[NDArray[np.float64]]:
-    """Light of the planet that the fit takes for star, (ny, nx) in each pointing's fitted square.
-    """
+    """Light of the planet that the fit takes for star, (ny, nx) on each fitted square."""
     if _is_companion(result, parts[0], sources[0]):
         return [np.zeros(part.window.shape) for part in parts]
     # s = J H^-1 G p, the image in every frame of the change of the unknowns to which the planet's

@@ -34,16 +34,8 @@ _LIBRARIES = ("torch", "numpy", "scipy", "astropy", "photutils", "matplotlib")
 def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any]:
     """Return what a reduction shows as nested dicts and lists of plain values.
 
-    Parameters
-    ----------
-    reduction : Reduction
-    klip : QTable, optional
-        Contrast curve of KLIP for the same frames.
-
-    Returns
-    -------
-    dict
-        Keys end in the unit of their values; None stands for what is not known.
+    `klip` is KLIP's contrast curve of the same frames. Keys end in the unit of their values; None
+    stands for what is not known.
     """
     sequence, detection = reduction.sequence, reduction.detection
     fit = reduction.fit
