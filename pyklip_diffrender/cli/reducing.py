@@ -92,14 +92,7 @@ _DERIVATIVES = 50e6
 
 
 def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, float]]:
-    """The stages of a reduction, each with its duration on two cores, s.
-
-    Parameters
-    ----------
-    sequence : Sequence
-        Cut to the fitted pixels, on which depends whether the library has a pattern for them.
-    options : ReduceOptions
-    """
+    """The stages of a reduction of a cut sequence, each with its duration on two cores, s."""
     count = len(sequence.science)
     systematics = options.systematics
     area = (options.size / 80) ** 2
@@ -407,13 +400,7 @@ def _age(opd: OPDMap, sequence: Sequence) -> str:
 
 
 def run(config: Path, output: Path, scheduler: str | None = None, *, progress: bool = False) -> int:
-    """Run a survey and say what it has shown.
-
-    Returns
-    -------
-    int
-        Exit status: 0 if all jobs are finished, 1 if some failed, 130 if interrupted.
-    """
+    """Run a survey, and return the exit status: 1 if some jobs failed, 130 if interrupted."""
     try:
         table = survey(config, output, scheduler, progress=progress)
     except KeyboardInterrupt:

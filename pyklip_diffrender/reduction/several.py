@@ -141,7 +141,7 @@ def sources_of(
     if not nodes:
         return []
     first, second = np.array(links, dtype=int).reshape(-1, 2).T
-    # Three filters or more make pairs of pairs: a source is a connected part of the graph of pairs.
+    # A source makes several pairs in three filters: it is a connected part of the graph of pairs.
     graph = coo_array((np.ones(len(links)), (first, second)), shape=(len(nodes), len(nodes)))
     _, labels = connected_components(graph, directed=False)
     sources = []
