@@ -96,6 +96,8 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
     count = len(sequence.science)
     systematics = options.systematics
     area = (options.size / 80) ** 2
+    # The time of a fit grows with the powers `_PIXELS` of the pixels and `_FRAMES` of the frames:
+    # most of it goes into the derivatives by the wavefront, for which the optics count.
     fit = _FIT * area**_PIXELS * (_QUICK if options.accuracy == "quick" else 1.0)
     steps = []
     searched = systematics == "auto" or isinstance(systematics, PatternLibrary)
@@ -129,6 +131,7 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
         steps.append(("whole frames", _WIDE * count))
     if options.injections:
         seconds = joint + refit + _SEARCH * area * count
+        # Each round adds several planets at once, and fits and searches the frames again.
         rounds = math.ceil(options.injections / TOGETHER)
         steps.append((f"{options.injections} injected planets", rounds * seconds))
     if options.completeness:

@@ -202,7 +202,7 @@ class PatternChoice:
     # libraries alone, from reference stars (and the library), or from the rolls, which share a
     # pattern of which only the size is known.
     origin: Origin = "none"
-    # That was searched.
+    # The one that was searched.
     library: PatternLibrary = field(default_factory=PatternLibrary)
 
     @property
@@ -281,8 +281,8 @@ def choose_systematics(
     "auto", or a `PatternLibrary` that is searched besides the package's, fits `references`, frames
     of other stars, only where the library has no pattern; "references" fits them in any case and
     uses both. A function is called for them only if they are needed. `library` is False for frames
-    that do not show its pattern, see `PatternChoice.is_refuted_by`. A reference star that cannot be
-    fitted is left out.
+    that do not show its pattern, see `PatternChoice.is_refuted_by`. Raises DiffrenderError if
+    frames that have to be moved cannot be fitted; a reference star that cannot be is left out.
     """
     systematics = as_request(systematics)
     common: dict[str, Any] = {

@@ -88,8 +88,8 @@ def pattern_pedestal(fits: Sequence[Refinement]) -> float:
     if pairs:
         return _pedestal_between_stars(pairs)
     # For rolls of one star the pattern must be taken to be as strong in all rings about it. The
-    # product of the residuals of two frames of the same pixels, averaged over a ring, is m^2 (s_1 +
-    # B) (s_2 + B) for a pattern of rms m. A least-squares fit to all rings gives m and B.
+    # product of the residuals of two frames of the same pixels, averaged over a ring, is
+    # m^2 (s_1 + B) (s_2 + B) for a pattern of rms m. A least-squares fit to all rings gives m, B.
     rings = [ring for fit in fits for ring in _products(fit)]
     if not rings:
         return 0.0
@@ -428,8 +428,9 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
     scatter = _scatter_between_frames(values, variances, stars, away)
     variances = np.where(_outliers(values, variances + scatter**2), np.inf, variances)
     width = _prior_width(values, variances, away)
-    # Posterior of a pixel m ~ N(0, width^2) that frames show as m + e, e ~ N(0, variance +
-    # scatter^2). Another frame shows it with its own scatter, which adds to the error of the mean.
+    # Posterior of a pixel m ~ N(0, width^2) that frames show as m + e with
+    # e ~ N(0, variance + scatter^2). Another frame shows it with its own scatter, which adds to the
+    # error of the mean.
     precision = (1 / (variances + scatter**2)).sum(axis=0)
     total = precision + width**-2.0
     pattern = (values / (variances + scatter**2)).sum(axis=0) / total
@@ -581,6 +582,7 @@ def _noise_ratio(values: Image, variances: Image, ring: NDArray[np.int64]) -> Im
 
 def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
     """Pixels of single frames, (patterns, ny, nx), that are far from the median of the others."""
+    # Of two frames that differ, nothing says which is wrong.
     known = np.isfinite(variances)
     if len(values) < 3:
         return ~known
@@ -591,8 +593,8 @@ def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
 def _prior_width(values: Image, variances: Image, away: Image) -> Image:
     """Standard deviation (ny, nx) of the pattern over the pixels of a ring."""
     # <v_a v_b> = width^2, because the noise of different frames is independent; squares of one
-    # frame would show, where noise dominates, how well its errors are known. Where it does, var(v_a
-    # v_b) = variance_a variance_b.
+    # frame would show, where noise dominates, how well its errors are known. Where it does,
+    # var(v_a v_b) = variance_a variance_b.
     ring = away.astype(np.int64)
     count = ring.max() + 1
     total, weight = np.zeros(count), np.zeros(count)

@@ -129,7 +129,7 @@ class SourceFrames:
     # The file of every frame.
     paths: list[Path]
     files: dict[Path, FrameFile]
-    # That the files were sorted into, if they were before pyKLIP read them.
+    # What the files were sorted into, if they were judged before pyKLIP read them.
     sequence: Sequence | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
@@ -481,7 +481,10 @@ def recorded_frames(
 
 
 def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
-    """Factor by which a frame (ny, nx) was multiplied since it was read; 1 if it was not."""
+    """Factor by which a frame (ny, nx) was multiplied since it was read; 1 if it was not.
+
+    Raises NotRecordedError if it is not positive.
+    """
     known = np.isfinite(before) & np.isfinite(now)
     if not known.any():
         return 1.0
@@ -800,6 +803,7 @@ def frames_of(
     that `admit` excludes stay NaN in the products. Raises NoValidPixelsError if no frame has a
     valid pixel.
     """
+    # Frames of reference stars may be among the dataset's: all are gathered, then the files judged.
     every = _gather(dataset, index, imgs, settings)
     observation, chosen = every.observation, index[every.usable]
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
@@ -868,6 +872,7 @@ def _gather(
             stacklevel=2,
         )
     if settings.error is not None:
+        # Frames have the unit of the files by now, and given errors that of the dataset.
         error = _broadcast(settings.error, index, dataset.input.shape) / factor[:, None, None]
         noise = "given"
     elif error is None:

@@ -105,7 +105,7 @@ def planet_in_frames(
     flipx: bool,
     filtered: Filter | None = None,
 ) -> dict[int, PlanetInFrame]:
-    """Forward model, not filtered, of a planet in all frames of one wavelength, by place in them.
+    """Forward model of a planet in the frames of one wavelength, by place in `frames`, unfiltered.
 
     `fm_class` (`FMPlanetPSF`) has separation in pixels, position angle, flux, and the user's PSF.
     `frames` (n,) are the dataset's indices of the fitted frames, which pyKLIP turns by `angles` in
@@ -371,7 +371,7 @@ class ForwardReduction(DatasetReduction):
         *args: Any,
         **kw: Any,
     ) -> tuple[Any, ...]:
-        """Replace `pyklip.fm.klip_parallelized`; returns five things.
+        """Replace `pyklip.fm.klip_parallelized`, with the same results.
 
         They are sub_imgs, fmout, perturbmag, the common centre (x, y), and noise. The first two are
         (b, n, ny, nx), turned to north: one equal slice for each of the b entries of numbasis.
@@ -426,6 +426,7 @@ class ForwardReduction(DatasetReduction):
                 flipx,
                 self._filter,
             )
+            # The cards are of one flux and position, so of one wavelength.
             if len(self.records) == 1:
                 first = next(part for part in record.subtraction.pointings if part.index == 0)
                 k, reduction = int(first.pointing.frames[0]), record.subtraction.reduction

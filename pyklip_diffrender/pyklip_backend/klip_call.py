@@ -310,7 +310,7 @@ def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
     added = frames.data - record.frames.data
     star = before.star.copy()
     # Star of the copy = star + J H^-1 G (added light), where every pointing has the added light
-    # that the fit would have averaged. Background included, of the pixels outside the square.
+    # that the fit would have averaged. Outside the fitted square only the background changes.
     for result in dict.fromkeys(part.result for part in before.pointings):
         parts = [part for part in before.pointings if part.result is result]
         light = {}
@@ -497,10 +497,10 @@ class DatasetReduction:
         IWA: float,
         **kw: Any,
     ) -> tuple[Any, ...]:
-        """Replace `pyklip.parallelized.klip_parallelized`; returns three things or four.
+        """Replace `pyklip.parallelized.klip_parallelized`, with the same results.
 
-        They are sub_imgs (b, n, ny, nx), one equal slice for each of the b entries of numbasis; [x,
-        y] of the common centre; noise, (b, n, ny, nx) if requested, else ``[1.]``; and, if
+        They are sub_imgs (b, n, ny, nx), one equal slice for each of the b entries of numbasis; x,
+        y of the common centre; noise, (b, n, ny, nx) if requested, else ``[1.]``; and, if
         requested, the unsubtracted frames (wavelengths, n, ny, nx).
         """
         index = np.flatnonzero(np.isin(self.dataset.wvs, np.unique(wvs)))
@@ -549,6 +549,7 @@ class DatasetReduction:
         """
         if self._before_injection:
             return
+        # The throughput follows from the linear model of one fit at each wavelength.
         results = [fit.result for record in self.records for fit in record.subtraction.fits]
         linear = all(getattr(result, "linear", None) is not None for result in results)
         if not linear or len(results) != len(self.records):

@@ -57,7 +57,8 @@ class FittedPointing:
     index: int  # place of the pointing among the frames of the fit
     pointing: Pointing
     window: Window  # the fitted square
-    away: Image  # (2,), x, y in pixels from the frames to the fitted ones, on the detector's pixels
+    # (2,), x, y in pixels by which the fitted frames were moved onto the pixels of the detector.
+    away: Image
 
     def __repr__(self) -> str:
         return f"<FittedPointing: {self.pointing!r}, {self.result!r}>"

@@ -165,6 +165,8 @@ def klip_curve(
     contrasts = _SIGMAS * noise.min(axis=0) / klip.norm
     response, alone = np.zeros_like(noise), np.zeros(len(separations))
     for s, separation in enumerate(separations):
+        # Evenly spread at every separation, and from one separation to the next by the golden
+        # angle, so that no direction is preferred.
         angles = np.radians(_GOLDEN * s + 360 / _TRIALS * np.arange(_TRIALS))
         wanted = separation * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         rows, columns = np.array([klip.pixel(each) for each in wanted]).T

@@ -449,6 +449,7 @@ def _roll(north: float | None) -> str:
 
 def _source_of(detection: Detection, place: int) -> int:
     """Place among the sources, which are in the order they were found, of a row of the table."""
+    # The table is in the order of the S/N.
     return int(np.argsort(-detection.sources.snr(detection.error_factor))[place])
 
 
@@ -471,6 +472,7 @@ def _stamps(detection: Detection, place: int) -> list[drawing.Stamp]:
             axis + scale * np.arange(-half, half + 1)
             for axis, scale in zip(frame.grid[row, column], observation.pixelscale, strict=True)
         )
+        # Of all candidates, only the light of this one stays in the picture without the star.
         data, left, model, noise = (
             np.pad(np.where(valid, image, np.nan), half, constant_values=np.nan)[window]
             for image in (

@@ -587,6 +587,8 @@ class _Run:
     def _choice(self, saved: Checkpoint) -> PatternChoice:
         """The choice of the pattern of an interrupted reduction, without fits of other stars."""
         options = self.preparation.options
+        # The pattern of reference stars or of the caller was stored. That of the library is looked
+        # up again, which moves the frames onto its pixels if need be.
         known = as_request(options.systematics)
         if saved.origin != "library":
             known = saved.systematics or "off"

@@ -54,8 +54,8 @@ def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
             return "The candidates are in line with the star, like an edge-on disk"
     places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
     distances = np.hypot(*(places[:, None] - places).T)[np.triu_indices(count, 1)]
-    # Each of the n (n - 1) / 2 pairs is within reach of each other with the probability (reach /
-    # edge)^2, the areas of two circles, so that their number has a Poisson distribution.
+    # Each of the n (n - 1) / 2 pairs is within reach of each other with the probability
+    # (reach / edge)^2, the ratio of two areas, so that their number is nearly Poisson's.
     reach = _NEAR * resolution
     expected = len(distances) * (reach / edge) ** 2
     if stats.poisson.sf((distances < reach).sum() - 1, expected) < _UNLIKELY:

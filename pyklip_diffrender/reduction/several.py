@@ -336,6 +336,8 @@ def _tracks(
                     _name(each),
                     np.array(offsets).reshape(-1, 2),
                     np.array(errors).reshape(-1, 2),
+                    # A source in the background moves opposite to the star's proper motion beside
+                    # it.
                     None if _together(start, each) else place - np.array(motion) * years,
                 )
             )

@@ -257,6 +257,7 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
     separation = curve["separation"].to_value("arcsec")
     inside = [s for s in _LIMITS if separation[0] - 1e-6 <= s <= separation[-1] + 1e-6]
     rows = []
+    # Limits fall by orders of magnitude with the separation: their logarithms are interpolated.
     for separation_arcsec in inside or [separation[-1]]:
         values = {
             name: float(np.exp(np.interp(separation_arcsec, separation, np.log(curve[name]))))

@@ -195,6 +195,8 @@ def with_references(
     joint: Refinement | None = None
     remarks: dict[str, str] = {}
     with stage("reference stars and target together"):
+        # Each round masks the companions that the joint fit shows, or else leaves out the frames
+        # that it does not explain, until there are neither.
         for _ in range(_ROUNDS):
             joint = None
             if not used:
@@ -258,6 +260,8 @@ def _that_fit_into(
     """As many frames as the memory allows, those nearest in time to the target first."""
     if memory is None:
         return list(references)
+    # A frame's derivatives are in single precision, four bytes each, and it takes `_FRAME` times
+    # them.
     derivatives = 4.0 * fit.linear.frames[0].jacobian.numel()
     spare = fit.settings.memory_beside(len(fit.frames) * derivatives) / (_FRAME * derivatives)
     date = fit.frames[0].observation.date
@@ -306,8 +310,8 @@ def _aligned(
 
 def _unexplained(aligned: Refinement) -> float:
     """Part of the star's light in a pixel that a fit of one frame leaves, robust to companions."""
-    # With the residual r, the noise s and the star's light l of a pixel, it is the k for which r^2
-    # / (s^2 + k^2 l^2) has the median of the square of a normal deviate.
+    # With the residual r, the noise s and the star's light l of a pixel, it is the k for which
+    # r^2 / (s^2 + k^2 l^2) has the median of the square of a normal deviate.
     (frame,) = aligned.frames
     observation = frame.observation.combined()
     valid = observation.valid[0]
@@ -331,6 +335,7 @@ def _frame_chi2(fit: Refinement) -> NDArray[np.float64]:
         valid, noise = observation.valid[0], observation.error[0]
         if fit.systematics is not None:
             light = frame.star - frame.values["background"][0] + frame.pedestal
+            # The pattern's error multiplies star and pedestal, as the pattern does.
             noise = np.hypot(noise, fit.systematics.at(observation)[1] * light)
         residual = observation.data[0] - frame.star - frame.companion_image
         values.append(float(np.mean((residual / noise)[valid] ** 2)))
@@ -368,6 +373,7 @@ def _with_companions_masked(
         x, y = source.offset
         away = np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y)
         near = away < _MASKED * joint.model.resolution
+        # Masked in an earlier round, so that its contrast is known no better than then.
         if not (observation.valid & near).any():
             continue
         is_new = True
