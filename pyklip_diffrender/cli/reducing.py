@@ -96,8 +96,7 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
     count = len(sequence.science)
     systematics = options.systematics
     area = (options.size / 80) ** 2
-    # The time of a fit grows with the powers `_PIXELS` of the pixels and `_FRAMES` of the frames:
-    # most of it goes into the derivatives by the wavefront, for which the optics count.
+    # The time of a fit grows with the powers `_PIXELS` of the pixels and `_FRAMES` of the frames.
     fit = _FIT * area**_PIXELS * (_QUICK if options.accuracy == "quick" else 1.0)
     steps = []
     searched = systematics == "auto" or isinstance(systematics, PatternLibrary)

@@ -373,7 +373,7 @@ def _with_companions_masked(
         x, y = source.offset
         away = np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y)
         near = away < _MASKED * joint.model.resolution
-        # Masked in an earlier round, so that its contrast is known no better than then.
+        # It was subtracted and masked in an earlier round.
         if not (observation.valid & near).any():
             continue
         is_new = True
