@@ -278,11 +278,11 @@ def choose_systematics(
 ) -> PatternChoice:
     """Choose the flat-field pattern for `science`, the frames of a target as they will be fitted.
 
-    "auto", or a `PatternLibrary` that is searched besides the package's, fits `references`, frames
-    of other stars, only where the library has no pattern; "references" fits them in any case and
-    uses both. A function is called for them only if they are needed. `library` is False for frames
-    that do not show its pattern, see `PatternChoice.is_refuted_by`. Raises DiffrenderError if
-    frames that have to be moved cannot be fitted; a reference star that cannot be is left out.
+    "auto", or a `PatternLibrary` to search besides the package's, fits `references`, frames of
+    other stars or a function that returns them, only where no library has a pattern; "references"
+    fits them in any case and uses both. `library` is False for frames that do not show its pattern.
+    Raises DiffrenderError if frames that have to be moved cannot be fitted; a reference star that
+    cannot be is left out.
     """
     systematics = as_request(systematics)
     common: dict[str, Any] = {

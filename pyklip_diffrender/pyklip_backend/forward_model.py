@@ -107,11 +107,10 @@ def planet_in_frames(
 ) -> dict[int, PlanetInFrame]:
     """Forward model of a planet in the frames of one wavelength, by place in `frames`, unfiltered.
 
-    `fm_class` (`FMPlanetPSF`) has separation in pixels, position angle, flux, and the user's PSF.
+    `fm_class` (`FMPlanetPSF`) has the planet and the user's PSF, which has been through `filtered`.
     `frames` (n,) are the dataset's indices of the fitted frames, which pyKLIP turns by `angles` in
-    degrees counter-clockwise (`flipx` as in `pyklip.klip.rotate`). `filtered` is the high-pass
-    filter that the user's PSF has been through. Raises RefinementError if a fit has no linear
-    model.
+    degrees counter-clockwise (`flipx` as in `pyklip.klip.rotate`). Raises RefinementError without a
+    linear model.
     """
     planets = {}
     for result in dict.fromkeys(pointing.result for pointing in pointings):

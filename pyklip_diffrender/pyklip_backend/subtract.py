@@ -270,10 +270,9 @@ def subtract_by_refinement(
 ) -> Subtraction:
     """Reduce the frames as `pyklip_diffrender.reduce` does, and render the star (the default).
 
-    `pointings` are the frames in order of time with what their files say, else `observation` is
-    sorted; `references` are frames of reference stars, and `tell` gets a line of text at every
-    stage. Raises RefinementError for an implausible fit; warns if it has not converged to a model
-    that explains the data.
+    `pointings` are the frames in order of time with what their files say, by default from
+    `observation`; `tell` gets a line of text at every stage. Raises RefinementError for an
+    implausible fit, and warns of one that has not converged.
     """
     model = model_of(observation, settings)
     # Takes a second to import, so only after the input has been checked.

@@ -130,11 +130,11 @@ def klip_curve(
 ) -> QTable:
     """5-sigma contrast curve of KLIP for the frames that were searched.
 
-    Its columns are named like those of `Detection.contrast_curve`. A contrast is NaN where no light
-    of a planet is left or the detection has no limits; throughput is the fraction of a planet's
-    image behind the mask that is left. `references` are cut to the same pixels; `separations`, in
-    arcsec, are by default twelve from 2 lambda/D to the edge of the frames. Raises
-    IncompatibleSetupError if a roll has no references, or no separation is in the frames.
+    Columns are as of `Detection.contrast_curve`; a contrast is NaN where no light of a planet is
+    left or the detection has no limits, and throughput the fraction of a planet's image behind the
+    mask. `references` are cut to the same pixels; `separations` are in arcsec, by default twelve
+    from 2 lambda/D to the edge. Raises IncompatibleSetupError if a roll has no references, or no
+    separation is in the frames.
     """
     templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
@@ -220,10 +220,10 @@ def klip_image(
 ) -> tuple[Image, Image, str]:
     """Subtract the star from the frames that were searched with KLIP, and combine them.
 
-    Returns the image (ny, nx) in the data's unit, NaN close to the star; x, y (ny, nx, 2) of its
-    pixels from the star, arcsec; and a label. It is turned counter-clockwise by `north` degrees
-    from the first frame. `science` takes the place of the fit's frames, from which a disk may have
-    been subtracted.
+    Returns the image (ny, nx) in the data's unit, NaN close to the star, turned counter-clockwise
+    by `north` degrees from the first frame; x, y (ny, nx, 2) of its pixels from the star, arcsec;
+    and a label. `science` takes the place of the fit's frames, from which a disk may have been
+    subtracted.
     """
     templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]

@@ -169,10 +169,9 @@ def with_references(
 ) -> Joined:
     """Fit the frames of reference stars, cut like the target's, together with those of the target.
 
-    `choice` has the flat-field pattern of `fit`, that of the target alone. With `search`, limits
-    are compared as they are stated, with errors scaled to the scatter of the S/N, else as the
-    linear models predict them. `memory` is in bytes that the process may take; frames that do not
-    fit are left out.
+    `choice` has the pattern of `fit`, that of the target alone. Limits are compared as `search`
+    states them, with errors scaled to the scatter of the S/N, else as the linear models predict
+    them. Frames that do not fit into `memory`, bytes of the process, are left out.
     """
     if not references or not fit.status.usable:
         return Joined(fit, Visit())
