@@ -29,18 +29,10 @@ _UNKNOWN = -1
 
 @dataclass(frozen=True)
 class _Mast:
-    """The part of astroquery that this module needs.
-
-    Attributes
-    ----------
-    observations : Observations
-    failures : tuple of exception classes
-        Raised where the archive does not answer.
-    no_results : warning class
-    """
+    """The part of astroquery that this module needs."""
 
     observations: Any
-    failures: tuple[type[Exception], ...]
+    failures: tuple[type[Exception], ...]  # raised where the archive does not answer
     no_results: type[Warning]
 
 

@@ -13,40 +13,18 @@ __all__ = ["LEVELS", "OPTICAL_PARAMETERS", "Parameter", "parameter"]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One named parameter, scalar or vector.
+    """One named parameter, scalar or vector."""
 
-    Attributes
-    ----------
-    name : str
-        The keyword of the forward model.
-    unit : str
-        Unit at the interface, in astropy's spelling ("" for a plain number).
-    size : int
-        Number of components.
-    default : float
-        Value when it is not given.
-    start : float
-        Value from which a fit starts when none is given.
-    lower, upper : float
-        Bounds of every component.
-    prior : float
-        Prior standard deviation about the start, generous as without any earlier measurement.
-    label : str
-        A few words for tables in a terminal, with ``{}`` for the component: x, y or its number.
-    description : str
-        One line.
-    """
-
-    name: str
-    unit: str
-    size: int
-    default: float
-    start: float
-    lower: float
+    name: str  # the keyword of the forward model
+    unit: str  # at the interface, in astropy's spelling ("" for a plain number)
+    size: int  # number of components
+    default: float  # when it is not given
+    start: float  # from which a fit starts when none is given
+    lower: float  # bound of every component
     upper: float
-    prior: float
-    label: str
-    description: str
+    prior: float  # standard deviation about the start, generous as without any earlier measurement
+    label: str  # a few words for tables, with ``{}`` for the component: x, y or its number
+    description: str  # one line
 
     def labels(self) -> list[str]:
         """Label of every component."""
@@ -103,13 +81,7 @@ LEVELS = (
 
 
 def parameter(name: str) -> Parameter:
-    """Look up a parameter by name.
-
-    Raises
-    ------
-    KeyError
-        If the table has no such name.
-    """
+    """Look up a parameter by name; raises KeyError if the table has no such name."""
     entries = {p.name: p for p in (*OPTICAL_PARAMETERS, *LEVELS)}
     if name not in entries:
         raise KeyError(f"{name!r} is not a parameter; expected one of {', '.join(entries)}")

@@ -584,12 +584,7 @@ def disk_check(free: float) -> Check:
 def check_fit(**settings: Any) -> Iterator[Check]:
     """Simulate a telescope whose segments have moved, and refine its wavefront.
 
-    The mirror is coarsely sampled and nothing but its segments moves, so that seconds suffice.
-
-    Parameters
-    ----------
-    **settings
-        Of `GaussNewton`, besides the basis.
+    `settings` are those of `GaussNewton`, besides the basis.
     """
     import numpy as np
     import torch
@@ -603,6 +598,7 @@ def check_fit(**settings: Any) -> Iterator[Check]:
     from pyklip_diffrender.wavefront.opd import random_opd
 
     began = time.perf_counter()
+    # The mirror is coarsely sampled and nothing but its segments moves, so that seconds suffice.
     model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=96, fov_pixels=24)
     basis, measured = SegmentMotions(), random_opd(1, npix=model.npix).data
     motions = 1e-8 * np.random.default_rng(2).normal(size=len(basis))
@@ -681,13 +677,9 @@ for _command in (
 
 
 def main(arguments: abc.Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line, and return the exit status.
 
-    Returns
-    -------
-    int
-        Exit status: 0, 1 for an error that a message explains, 2 for wrong options, 130 if
-        interrupted.
+    It is 0, 1 for an error that a message explains, 2 for wrong options, and 130 if interrupted.
     """
     # Threads of PyTorch that wait in a loop take the processor from other processes. Libraries read
     # this when they are loaded, which is later.

@@ -92,17 +92,11 @@ _DERIVATIVES = 50e6
 
 
 def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, float]]:
-    """The stages of a reduction, each with its duration on two cores, s.
-
-    Parameters
-    ----------
-    sequence : Sequence
-        Cut to the fitted pixels, on which depends whether the library has a pattern for them.
-    options : ReduceOptions
-    """
+    """The stages of a reduction of a cut sequence, each with its duration on two cores, s."""
     count = len(sequence.science)
     systematics = options.systematics
     area = (options.size / 80) ** 2
+    # The time of a fit grows with the powers `_PIXELS` of the pixels and `_FRAMES` of the frames.
     fit = _FIT * area**_PIXELS * (_QUICK if options.accuracy == "quick" else 1.0)
     steps = []
     searched = systematics == "auto" or isinstance(systematics, PatternLibrary)
@@ -136,6 +130,7 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
         steps.append(("whole frames", _WIDE * count))
     if options.injections:
         seconds = joint + refit + _SEARCH * area * count
+        # Each round adds several planets at once, and fits and searches the frames again.
         rounds = math.ceil(options.injections / TOGETHER)
         steps.append((f"{options.injections} injected planets", rounds * seconds))
     if options.completeness:
@@ -407,13 +402,7 @@ def _age(opd: OPDMap, sequence: Sequence) -> str:
 
 
 def run(config: Path, output: Path, scheduler: str | None = None, *, progress: bool = False) -> int:
-    """Run a survey and say what it has shown.
-
-    Returns
-    -------
-    int
-        Exit status: 0 if all jobs are finished, 1 if some failed, 130 if interrupted.
-    """
+    """Run a survey, and return the exit status: 1 if some jobs failed, 130 if interrupted."""
     try:
         table = survey(config, output, scheduler, progress=progress)
     except KeyboardInterrupt:

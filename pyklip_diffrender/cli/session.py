@@ -139,11 +139,9 @@ def _takes_text(stream: Any) -> bool:
 
 @contextmanager
 def open_streams() -> Iterator[None]:
-    """Put an empty file in place of standard streams that are missing or closed.
-
-    Without them, as under ``pythonw``, in a job of a scheduler or after ``2>&-``, the first message
-    or progress bar would end the program.
-    """
+    """Put an empty file in place of standard streams that are missing or closed."""
+    # Without them, as under ``pythonw``, in a job of a scheduler or after ``2>&-``, the first
+    # message or progress bar would end the program.
     before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
     with open(os.devnull, "w", encoding="utf-8") as nowhere:
         try:
@@ -159,21 +157,14 @@ def open_streams() -> Iterator[None]:
 
 @dataclass
 class Run:
-    """One run of a command.
+    """One run of a command."""
 
-    Attributes
-    ----------
-    progress : bool
-        Whether to show progress bars.
-    device : str
-        PyTorch device.
-    configured : bool
-        Whether names in messages are keys of a configuration file, as those of surveys, and no
-        options of the command line.
-    """
-
+    # Whether to show progress bars.
     progress: bool = False
+    # Of PyTorch.
     device: str = "cpu"
+    # Whether names in messages are keys of a configuration file, as those of surveys, and no
+    # options of the command line.
     configured: bool = False
     _output: Path | None = None
     _before: dict[Path, int] = field(default_factory=dict)
@@ -239,12 +230,7 @@ class Run:
         self._handlers.append(handler)
 
     def claim_folder(self, folder: Path, products: tuple[str, ...], overwrite: bool) -> None:
-        """Refuse, before any work, products that could not be written or would be replaced.
-
-        Raises
-        ------
-        IncompatibleSetupError
-        """
+        """Raise IncompatibleSetupError if products cannot be written or would be replaced."""
         _require_no_broken_link(folder, "--output")
         if folder.exists() and not folder.is_dir():
             raise IncompatibleSetupError(f"--output: {folder} is a file, expected a folder")
@@ -253,12 +239,7 @@ class Run:
         self._claim(folder, _existing(folder), [folder / name for name in products], overwrite)
 
     def claim_file(self, path: Path, overwrite: bool) -> None:
-        """Refuse, before any work, a file that could not be written or would be replaced.
-
-        Raises
-        ------
-        IncompatibleSetupError
-        """
+        """Raise IncompatibleSetupError if a file cannot be written or would be replaced."""
         _require_no_broken_link(path, "OUTPUT")
         if not path.absolute().parent.is_dir():
             raise IncompatibleSetupError(
@@ -281,12 +262,7 @@ class Run:
         self._output, self._before = output, _files(output)
 
     def require_room(self, folder: Path, size: float) -> None:
-        """Refuse, before any work, products for which there is no room on the disk.
-
-        Raises
-        ------
-        IncompatibleSetupError
-        """
+        """Raise IncompatibleSetupError if the disk has no room for products of `size` bytes."""
         free = shutil.disk_usage(_existing(folder)).free
         if free < size:
             raise IncompatibleSetupError(
@@ -405,10 +381,7 @@ def _config_callback(ctx: click.Context, _: click.Parameter, path: Path | None) 
 def read_config(command: click.Command, path: Path) -> dict[str, Any]:
     """Read the defaults for a command, or for all commands of a group, from a TOML file.
 
-    Raises
-    ------
-    click.UsageError
-        If the file cannot be read, or has an unknown option.
+    Raises click.UsageError if the file cannot be read, or has an unknown option.
     """
     from pyklip_diffrender.io.files import read_text
 

@@ -57,18 +57,7 @@ _REFERENCE_SHIFT = 10
 
 @dataclass
 class DemoResult:
-    """Everything that the demo computed.
-
-    Attributes
-    ----------
-    images : dict of str to ndarray
-        Star-subtracted frames, photons: "initial", "KLIP", "refined", "detected" (refined again
-        with the detected planets in the model), "optimal".
-    table : Table
-        One row per image: annulus SNR, planet throughput, star-model error, seconds.
-    detection : Detection
-        Point sources with the wavefront marginalised.
-    """
+    """Everything that the demo computed."""
 
     model: OpticalSystem
     scene: Scene
@@ -76,9 +65,14 @@ class DemoResult:
     measured: OPDMap
     true_opd: Image
     fit: Refinement
+    # Star-subtracted frames, photons: "initial", "KLIP", "refined", "detected" (refined again with
+    # the detected planets in the model), "optimal".
     images: dict[str, Image]
+    # (ny, nx), standard deviations, photons.
     noise: Image
+    # One row per image: annulus SNR, planet throughput, star-model error, seconds.
     table: Table
+    # Point sources with the wavefront marginalised.
     detection: Detection
 
     def __repr__(self) -> str:
@@ -106,22 +100,10 @@ def run_demo(
     progress: bool = False,
     device: str = "cpu",
 ) -> DemoResult:
-    """Simulate, refine, subtract, and run KLIP on the same frame.
+    """Simulate, refine, subtract, and run KLIP on the same frame of `size` pixels a side.
 
-    Parameters
-    ----------
-    contrast, separation, position_angle : float
-        The planet, in arcsec and degrees.
-    hours : float
-        Age of the wavefront map.
-    size : int
-        Side of the frame in pixels.
-    seed : int
-        Random seed of wavefront, drift and noise.
-    progress : bool
-        Show progress bars.
-    device : str
-        PyTorch device of the model.
+    The planet's place is in arcsec and degrees. The wavefront map is `hours` old; `seed` is that of
+    wavefront, drift and noise.
     """
     planet = Planet(contrast, separation, position_angle)
     scene = Scene(planets=(planet,))
@@ -233,12 +215,7 @@ _LIMIT = 6.0
 
 
 def draw_demo(result: DemoResult) -> Any:
-    """Draw the frame, four subtractions over the noise, the wavefront's change and the S/N map.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Draw the frame, four subtractions over the noise, the wavefront's change and the S/N map."""
     figure, axes = drawing.new_figure(2, 4)
     grid, planet = result.fit.frames[0].grid, [result.scene.planets[0].offset]
     frame = np.maximum(result.observation.data[0], 1)

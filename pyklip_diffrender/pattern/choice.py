@@ -74,33 +74,29 @@ _INNER = 0.3
 def place_on_detector(fit: Refinement, pattern: Systematics) -> Observation | None:
     """Move the frames of a fit onto the pixels of the detector that a pattern was measured on.
 
-    Parameters
-    ----------
-    fit : Refinement
-        Of one observation, without a pattern.
-    pattern : Systematics
-        With `first_pixel`.
-
-    Returns
-    -------
-    Observation or None
-        Shifted by less than a pixel, with `first_pixel`; None if the pattern is not detected.
+    They are of one observation and were fitted without a pattern. The result is shifted by less
+    than a pixel and has `first_pixel`; it is None if the pattern is not detected.
     """
     frame, (measured,) = fit.frames[0], measure_patterns(fit)
     observation = frame.observation
     if pattern.first_pixel is None:
         return None
+    # Stars behind the same mask are within a few pixels of each other on the detector, so the
+    # pattern is first put where its star is on that of the frame, to whole pixels. The search then
+    # moves it by up to `_REACH` pixels in steps, and about the best place in finer ones.
     start = np.round(np.subtract(measured.center, pattern.center)).astype(int)
     column, row = np.subtract(pattern.first_pixel, start).tolist()
     expected = pattern.at(replace(observation, first_pixel=(column, row)))[0]
     y, x = np.indices(expected.shape)
     scale_x, scale_y = frame.model.detector.pixelscale
     distance = np.hypot((x - measured.center[0]) * scale_x, (y - measured.center[1]) * scale_y)
+    # Inverse variances of the ratio: that of its noise, and that of the errors of the model.
     weight = np.where(distance > _INNER, 1 / (measured.variance + _MODEL_ERROR**2), 0.0)
     steps = np.arange(-_REACH, _REACH + _COARSE / 2, _COARSE)
     coarse = _correlation(measured.value, expected, weight, steps, steps)
     row, column = np.unravel_index(int(coarse.argmax()), coarse.shape)
     best = np.array([steps[column], steps[row]])
+    # Beyond its peak the correlation scatters as it would without the pattern.
     elsewhere = np.hypot(*np.meshgrid(steps - best[0], steps - best[1])) > _SEPARATE
     scatter = float(coarse[elsewhere].std())
     _log.info("pattern seen at %s pixels, correlation %.2f, elsewhere %.3f",
@@ -135,7 +131,10 @@ def _correlation(
     right: NDArray[np.floating],
     up: NDArray[np.floating],
 ) -> NDArray[np.float64]:
-    """Weighted correlation of a ratio with the pattern shifted, (up, right)."""
+    """Weighted correlation (up, right) of a ratio (ny, nx) with the pattern, shifted in pixels."""
+    # c = sum w v m / sqrt(sum w v^2 sum w m^2), where v and the moved pattern m are without their
+    # weighted means, so that neither a background nor an error of the flux counts. A shift is a
+    # phase in Fourier space.
     transform = np.fft.fft2(pattern)
     total = weight.sum()
     centred = value - (weight * value).sum() / total
@@ -187,35 +186,23 @@ all separations."""
 
 @dataclass(frozen=True, eq=False)
 class PatternChoice:
-    """The pattern that a fit of the target uses, and what goes with it.
+    """The pattern that a fit of the target uses, and what goes with it."""
 
-    Attributes
-    ----------
-    science : tuple of Observation
-        Frames of the target, moved onto the pixels of the pattern where their files do not say
-        which pixels they have.
-    systematics : Systematics or None
-        The pattern.
-    settings : GaussNewton or None
-        Settings of the target's fit.
-    references : tuple of Refinement
-        One for each reference star that was fitted.
-    failed : tuple of (str, str)
-        Reference stars that could not be fitted, and why.
-    origin : {"none", "off", "given", "library", "references", "rolls"}
-        Where the pattern comes from: nowhere, because none is known or none was wanted; from the
-        caller, from libraries alone, from reference stars (and the library), or from the rolls,
-        which share a pattern of which only the size is known.
-    library : PatternLibrary
-        The library that was searched.
-    """
-
+    # Frames of the target, moved onto the pixels of the pattern where their files do not say which
+    # pixels they have.
     science: tuple[Observation, ...]
     systematics: Systematics | None
+    # Of the target's fit.
     settings: GaussNewton | None
+    # One fit for each reference star that was fitted.
     references: tuple[Refinement, ...] = ()
+    # Reference stars that could not be fitted, and why.
     failed: tuple[tuple[str, str], ...] = ()
+    # Nowhere ("none"), because none is known or ("off") none was wanted; from the caller, from
+    # libraries alone, from reference stars (and the library), or from the rolls, which share a
+    # pattern of which only the size is known.
     origin: Origin = "none"
+    # The one that was searched.
     library: PatternLibrary = field(default_factory=PatternLibrary)
 
     @property
@@ -251,22 +238,14 @@ class PatternChoice:
         return own is None or any(pattern.flat != own for pattern in known)
 
     def is_refuted_by(self, fit: Refinement) -> bool:
-        """Return True if a fit shows less than half of the library's pattern.
-
-        A warning is logged if it shows less than half of its pattern, whatever its origin.
-        """
+        """Whether a fit shows less than half of the library's pattern; for any, the log warns."""
         return lacks_pattern(fit) and self.origin == "library"
 
 
 def as_request(systematics: object) -> PatternRequest:
     """Make a request for a pattern; paths are those of files, or of a folder of libraries.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        For anything else, and for a path that does not exist.
-    CorruptFileError
-        For a file or a folder without a pattern.
+    Raises IncompatibleSetupError for anything else, CorruptFileError for a file without a pattern.
     """
     match systematics:
         case "auto" | "references" | "off" | Systematics() | PatternLibrary():
@@ -297,39 +276,13 @@ def choose_systematics(
     memory: float | None = None,
     progress: bool = False,
 ) -> PatternChoice:
-    """Choose the flat-field pattern for a target.
+    """Choose the flat-field pattern for `science`, the frames of a target as they will be fitted.
 
-    Parameters
-    ----------
-    science : sequence of Observation
-        Frames of the target, as they will be fitted.
-    references : sequence of Observation, or callable
-        Frames of other stars; a function that returns them is called only if they are needed.
-    model : OpticalSystem
-    opd : OPDMap
-        The wavefront to start from.
-    systematics : Systematics, PatternLibrary, "auto", "references" or "off"
-        "auto" takes the pattern of the library, and fits the references only where it has none;
-        "references" fits them in any case and uses both. Where neither knows anything, rolls that
-        show the same pixels of the detector share a pattern of which only the size is known. With
-        a `PatternLibrary`, the choice is as for "auto", with its patterns and those of the
-        package.
-    library : bool
-        False leaves libraries out, for frames that do not show their pattern, see
-        `PatternChoice.is_refuted_by`.
-    settings : GaussNewton, optional
-        Of the fits; default those of `refine`.
-    memory : float, optional
-        See `GaussNewton.memory`; by default that of the settings.
-    progress : bool
-        Show progress bars.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For another value of `systematics`.
-    DiffrenderError
-        If frames that must be moved cannot be fitted. A reference star that cannot be is left out.
+    "auto", or a `PatternLibrary` to search besides the package's, fits `references`, frames of
+    other stars or a function that returns them, only where no library has a pattern; "references"
+    fits them in any case and uses both. `library` is False for frames that do not show its pattern.
+    Raises DiffrenderError if frames that have to be moved cannot be fitted; a reference star that
+    cannot be is left out.
     """
     systematics = as_request(systematics)
     common: dict[str, Any] = {
@@ -346,6 +299,8 @@ def choose_systematics(
     if systematics != "off" and not isinstance(systematics, Systematics):
         first = science[0]
         known = _library(systematics) if library else PatternLibrary()
+        # In this order: the pattern of the library; that of reference stars, whose fits take time;
+        # and that of the rolls, of which only the size is known.
         if systematics != "references" and library:
             pattern = known_systematics(first, library=known)
             if pattern is not None:
@@ -373,18 +328,10 @@ def choose_systematics(
 def pattern_for_visit(
     choice: PatternChoice, science: Sequence[Observation], references: Sequence[Observation]
 ) -> Systematics | None:
-    """The flat-field pattern for a fit of all frames of a visit.
-
-    A pattern that was learned from one of these stars would count its frames twice, and patterns
-    of other stars are taken instead. Where there are none, frames that show the same pixels of the
-    detector share a pattern of which only the size is known.
-
-    Parameters
-    ----------
-    choice : PatternChoice
-        That of the target's own fit.
-    science, references : sequence of Observation
-    """
+    """The pattern for a fit of all frames of a visit; `choice` is that of the target's own fit."""
+    # A pattern that was learned from one of the fitted stars would count its frames twice: the
+    # pattern of other stars is taken, or else one of unknown values that frames of the same pixels
+    # share.
     if choice.origin in ("off", "given"):
         return choice.systematics
     if choice.origin == "library":
@@ -513,10 +460,7 @@ def _rough_fit(
 def is_refuted_by_first_frame(
     choice: PatternChoice, model: OpticalSystem, opd: OPDMap, *, progress: bool = False
 ) -> bool:
-    """Whether the first frame alone shows less than half of the library's pattern.
-
-    Its rough fit takes a tenth of the time of a fit of two rolls, which need not be repeated then.
-    """
+    """Whether the first frame alone shows less than half of the library's pattern."""
     rough = _rough_fit(
         model,
         choice.science[0],
@@ -548,29 +492,13 @@ def fit_with_pattern(
 ) -> tuple[PatternChoice, Refinement]:
     """Choose a pattern and fit the target; once more without the library if it is refuted.
 
-    Frames that were calibrated with another flat field do not have the library's pattern, which
-    only a fit can tell.
-
-    Parameters
-    ----------
-    science, references, model, opd
-        See `choose_systematics`.
-    fit : callable
-        Fits the target with a choice. The second argument is True for the fit without the library.
-    **options
-        Keywords of `choose_systematics`.
-
-    Returns
-    -------
-    choice : PatternChoice
-        The pattern of the last fit.
-    fit : Refinement
-
-    Raises
-    ------
-    DiffrenderError
-        As `choose_systematics` and `fit`.
+    `fit` fits with a choice; its second argument is True without the library. `options` are those
+    of `choose_systematics`, of which this also raises the errors. The choice is that of the last
+    fit.
     """
+    # Only a fit can tell that frames which were calibrated with another flat field do not have the
+    # library's pattern. Where the headers make that likely, the first frame is asked before all are
+    # fitted: its rough fit takes a tenth of the time of two rolls'.
     choice = choose_systematics(science, references, model, opd, **options)
     if choice.has_other_flat_field:
         with stage("pattern of the library in the first frame"):

@@ -242,6 +242,9 @@ def _learn(epochs: Sequence[_Epoch], fitter: _Fitter) -> tuple[list[Any], list[d
     pedestal = pattern_pedestal(list(alone.values()))
     last, rows = [], []
     for epoch, first in alone.items():
+        # The pattern of the others owes nothing to this star's frames and companions, so that
+        # chi-squared with it says what a pattern is worth for a star that it was not learned from.
+        # In the second fit the wavefront imitates less of the pattern, which is measured again.
         others = [fit for other, fit in alone.items() if not same_name(other.star, epoch.star)]
         library = PatternLibrary(tuple(measure_patterns(others, pedestal)))
         known = known_systematics(epoch.science[0], library=library)

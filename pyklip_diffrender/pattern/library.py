@@ -107,6 +107,7 @@ class PatternLibrary:
             and not any(same_name(pattern.star, each) for each in star.names)
             and _covered(pattern, observation) >= _COVERED
         ]
+        # Patterns are errors of one flat field: those of several must not be averaged.
         flats = Counter(pattern.flat for pattern in chosen)
         own = flat_of(observation)
         flat = own if own in flats else max(flats, key=lambda each: flats[each], default=None)
@@ -242,6 +243,7 @@ def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
     """
     if pattern.first_pixel is None or observation.first_pixel is None:
         return 1.0
+    # Columns and rows on the detector: the overlap of two rectangles.
     starts = np.array([pattern.first_pixel, observation.first_pixel])
     shapes = np.array([pattern.value.shape[::-1], observation.shape[::-1]])
     overlap = (starts + shapes).min(axis=0) - starts.max(axis=0)

@@ -77,24 +77,19 @@ class _Pair(NamedTuple):
 
 
 def pattern_pedestal(fits: Sequence[Refinement]) -> float:
-    """Estimate the pedestal with which one pattern holds near the star and far from it.
+    """The pedestal, in the frames' unit, with which one pattern holds near the star and far away.
 
-    Frames have a fixed pattern that does not become fainter with the distance from the star. In
-    frames of two stars s of different brightness the residuals r of a pixel obey
-    r_1 / (s_1 + B) = r_2 / (s_2 + B), which gives the pedestal B by robust total least squares.
-
-    For rolls of one star the pattern must be taken to be as strong in all rings about it. The
-    product of the residuals of two frames of the same pixels, averaged over a ring, is
-    m^2 (s_1 + B) (s_2 + B) for a pattern of rms m. A least-squares fit to all rings gives m and B.
-
-    Returns
-    -------
-    float
-        In the unit of the frames; 0 where no two frames of a fit show the same pixels.
+    It is 0 where no two frames of a fit show the same pixels.
     """
+    # Frames have a fixed pattern m that does not become fainter with the distance from the star. In
+    # frames of two stars s of different brightness the residuals of a pixel are r = m (s + B), so
+    # r_1 / (s_1 + B) = r_2 / (s_2 + B): a fit by robust total least squares gives B.
     pairs = list(_pairs_of_stars(fits))
     if pairs:
         return _pedestal_between_stars(pairs)
+    # For rolls of one star the pattern must be taken to be as strong in all rings about it. The
+    # product of the residuals of two frames of the same pixels, averaged over a ring, is
+    # m^2 (s_1 + B) (s_2 + B) for a pattern of rms m. A least-squares fit to all rings gives m, B.
     rings = [ring for fit in fits for ring in _products(fit)]
     if not rings:
         return 0.0
@@ -102,6 +97,7 @@ def pattern_pedestal(fits: Sequence[Refinement]) -> float:
 
     def misfit(pedestal: float) -> float:
         shape = (first + pedestal) * (second + pedestal)
+        # m^2 for this B: least squares are linear in it.
         strength = (shape * product / error**2).sum() / ((shape / error) ** 2).sum()
         return float((((product - strength * shape) / error) ** 2).sum())
 
@@ -133,6 +129,7 @@ def _pedestal_between_stars(pairs: Sequence[_Pair]) -> float:
     def misfit(pedestal: float) -> float:
         total = 0.0
         for light, left, noise in pairs:
+            # r_1 (s_2 + B) - r_2 (s_1 + B) is 0 but for the noise of both residuals.
             other = light[::-1] + pedestal
             deviation = (left[0] * other[0] - left[1] * other[1]) ** 2
             ratio = deviation / ((noise * other) ** 2).sum(axis=0)
@@ -186,6 +183,7 @@ def light_and_residual(frame: FrameFit) -> tuple[Image, Image, Image, NDArray[np
     combined = frame.observation.combined()
     background = float(frame.values["background"][0])
     known = frame.pedestal
+    # star = s (1 + m) + B m + background = (s + B) g - B + background, with the gain g = 1 + m.
     light = (frame.star - background + known) / frame.gain - known
     left = combined.data[0] - background - frame.companion_image - light
     return light, left, combined.error[0], combined.valid[0]
@@ -254,6 +252,8 @@ def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     """
     if fit.systematics is None:
         return None
+    # The residual of a fit with the pattern m is (size - 1) m (s + B): its amplitude and error are
+    # those of a template, marginalised over the unknowns.
     templates = {}
     for k, frame in enumerate(fit.frames):
         light = light_and_residual(frame)[0] + frame.pedestal
@@ -266,10 +266,7 @@ def pattern_size(fit: Refinement) -> tuple[float, float] | None:
 
 
 def lacks_pattern(fit: Refinement) -> bool:
-    """Whether the frames of a fit show less than half of its known pattern.
-
-    If so, a warning is logged.
-    """
+    """Whether frames of a fit show less than half of its known pattern; if so, the log warns."""
     measured = pattern_size(fit)
     if measured is None:
         return False
@@ -294,56 +291,37 @@ _SMOOTH = 1.0
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPattern:
-    """Residual over star, as one frame shows it.
-
-    Attributes
-    ----------
-    star : str
-    value : ndarray, (ny, nx)
-        Residual over the sum of star and pedestal; 0 where not known.
-    variance : ndarray, (ny, nx)
-        Of the data's noise; inf where not known.
-    center : tuple of float
-        x, y of the star, 0-indexed pixels.
-    first_pixel : tuple of int or None
-        Column and row of the first pixel on the full detector, as of an `Observation`.
-    filter, image_mask : str or None
-    frame, date : str
-        Where and when it was measured.
-    pedestal : float
-        As of `Systematics`.
-    detector : str or None
-        As headers name it, such as NRCALONG.
-    flat : str or None
-        Name of the flat field with which the frame was calibrated (R_FLAT).
-    light : ndarray, (ny, nx), or None
-        The star without the pattern, in the unit of the frame; None where it was not kept.
-    catalogue : CatalogueStar
-        Names and place of the star.
-    """
+    """Residual over star, as one frame shows it."""
 
     star: str
+    # (ny, nx), residual over the sum of star and pedestal; 0 where not known.
     value: Image
+    # (ny, nx), of the data's noise; inf where not known.
     variance: Image
+    # x, y of the star, 0-indexed pixels.
     center: tuple[float, float]
+    # Column and row of the first pixel on the full detector, as of an `Observation`.
     first_pixel: tuple[int, int] | None = None
     filter: str | None = None
     image_mask: str | None = None
+    # Where and when it was measured.
     frame: str = ""
     date: str = ""
+    # As of `Systematics`, in the unit of the frame.
     pedestal: float = 0.0
+    # As headers name it, such as NRCALONG.
     detector: str | None = None
+    # Name of the flat field with which the frame was calibrated (R_FLAT).
     flat: str | None = None
+    # (ny, nx), the star without the pattern, in the unit of the frame; None where it was not kept.
     light: Image | None = None
+    # Names and place of the star.
     catalogue: CatalogueStar = field(default_factory=CatalogueStar)
 
     def with_pedestal(self, pedestal: float) -> MeasuredPattern:
         """Return the pattern as a fraction of the sum of the star and another pedestal.
 
-        Raises
-        ------
-        IncompatibleSetupError
-            If the pattern has another pedestal, and its star was not kept.
+        Raises IncompatibleSetupError for another one than its own if its star was not kept.
         """
         if pedestal == self.pedestal:
             return self
@@ -355,6 +333,7 @@ class MeasuredPattern:
             )
         multiplied = self.light + pedestal
         usable = np.isfinite(self.variance) & (multiplied > 0)
+        # The residual is m (s + B) = m' (s + B').
         ratio = (self.light + self.pedestal) / np.where(usable, multiplied, 1.0)
         variance = np.where(usable, self.variance, 0.0) * ratio**2
         return replace(
@@ -419,11 +398,7 @@ def measure_patterns(
 ) -> list[MeasuredPattern]:
     """Measure the pattern in every frame of the fits that did not fail.
 
-    Parameters
-    ----------
-    fits : Refinement or sequence of Refinement
-    pedestal : float, optional
-        As of `Systematics`, in the unit of the frames. By default it is estimated.
+    The pedestal, as of `Systematics` in the unit of the frames, is estimated by default.
     """
     several = [fits] if isinstance(fits, Refinement) else list(fits)
     usable = [fit for fit in several if fit.status.usable]
@@ -433,16 +408,10 @@ def measure_patterns(
 
 
 def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = None) -> Systematics:
-    """Average measured patterns, see `learn_systematics`.
+    """Average measured patterns, see `learn_systematics`, with one pedestal (`common_pedestal`).
 
-    Patterns with different pedestals are brought to that of the patterns whose star was not kept,
-    or else to the median.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For none, for patterns of different filters, and for patterns with different pedestals whose
-        stars were not kept.
+    Raises IncompatibleSetupError for patterns of several filters or none, and if the pedestals
+    differ of patterns whose stars were not kept.
     """
     filters = {pattern.filter for pattern in patterns}
     if len(filters) != 1:
@@ -459,6 +428,9 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
     scatter = _scatter_between_frames(values, variances, stars, away)
     variances = np.where(_outliers(values, variances + scatter**2), np.inf, variances)
     width = _prior_width(values, variances, away)
+    # Posterior of a pixel m ~ N(0, width^2) that frames show as m + e with
+    # e ~ N(0, variance + scatter^2). Another frame shows it with its own scatter, which adds to the
+    # error of the mean.
     precision = (1 / (variances + scatter**2)).sum(axis=0)
     total = precision + width**-2.0
     pattern = (values / (variances + scatter**2)).sum(axis=0) / total
@@ -483,7 +455,7 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
 
 
 def common_pedestal(patterns: Sequence[MeasuredPattern]) -> float:
-    """The pedestal to which `combine_patterns` brings patterns."""
+    """The pedestal of the patterns whose star was not kept, or else the median of all."""
     fixed = [pattern.pedestal for pattern in patterns if pattern.light is None]
     return float(np.median(fixed or [pattern.pedestal for pattern in patterns]))
 
@@ -522,18 +494,13 @@ def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
 def _on_common_pixels(
     patterns: Sequence[MeasuredPattern],
 ) -> tuple[Image, Image, tuple[float, float], tuple[int, int] | None]:
-    """Put values and variances on an array that holds all patterns, each pixel on one of them.
+    """Values and variances (patterns, ny, nx) on an array that holds all patterns.
 
-    Pixels are matched on the detector where all patterns say which ones they have, else by the
-    position of the star.
-
-    Returns
-    -------
-    values, variances : ndarray, (patterns, ny, nx)
-    center : tuple of float
-        The first pattern's star.
-    first_pixel : tuple of int or None
+    Also x, y of the first pattern's star, and `first_pixel`, which is None unless all patterns have
+    one.
     """
+    # Pixels are matched on the detector where all patterns say which ones they have, else by the
+    # position of the star, to whole pixels.
     on_detector = all(pattern.first_pixel is not None for pattern in patterns)
     starts = np.array(
         [
@@ -568,12 +535,11 @@ def _on_pixels(variance: NDArray[np.float64], away: Image) -> Image:
 def _scatter_between_frames(
     values: Image, variances: Image, stars: Sequence[str], away: Image
 ) -> Image:
-    """Standard deviation of the ratio between frames beyond noise, on the pixels.
-
-    From frames of different stars where there are any: frames of one star share what is
-    particular to it. The variance of a single ring is so uncertain that it may come out negative:
-    neighbouring rings are averaged.
-    """
+    """Standard deviation (ny, nx) of the ratio between frames beyond their noise."""
+    # Frames of different stars, where there are any: those of one star share what is particular to
+    # it. var(v_a - v_b) = noise_a + noise_b + 2 scatter^2. The error of a variance is in proportion
+    # to it, hence the weights 1 / noise^2. In a single ring it is so uncertain that the difference
+    # may be negative, so neighbouring rings are averaged.
     ring = away.astype(np.int64)
     pairs = [(a, b) for a in range(len(stars)) for b in range(a + 1, len(stars))]
     across = [(a, b) for a, b in pairs if stars[a] != stars[b]] or pairs
@@ -596,11 +562,9 @@ def _scatter_between_frames(
 
 
 def _noise_ratio(values: Image, variances: Image, ring: NDArray[np.int64]) -> Image:
-    """Ratio of the noise's variance in a ring to the stated one, if below 1, on the pixels.
-
-    The noise of resampled frames is correlated between neighbours. Errors are such that they hold
-    for an image of several pixels, and the noise of a single pixel is less.
-    """
+    """Ratio (ny, nx) of the noise's variance in a ring to the stated one, at most 1."""
+    # The noise of resampled frames is correlated between neighbours. Errors are such that they hold
+    # for an image of several pixels, and the noise of a single pixel is less.
     count = ring.max() + 1
     total, weight = np.zeros(count), np.zeros(count)
     for a, b in combinations(range(len(values)), 2):
@@ -617,7 +581,8 @@ def _noise_ratio(values: Image, variances: Image, ring: NDArray[np.int64]) -> Im
 
 
 def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
-    """Pixels of single frames that are far from the median of the others."""
+    """Pixels of single frames, (patterns, ny, nx), that are far from the median of the others."""
+    # Of two frames that differ, nothing says which is wrong.
     known = np.isfinite(variances)
     if len(values) < 3:
         return ~known
@@ -626,11 +591,10 @@ def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
 
 
 def _prior_width(values: Image, variances: Image, away: Image) -> Image:
-    """Standard deviation of the pattern over the pixels of a ring.
-
-    From products of different frames, whose noise is independent: where noise dominates, squares of
-    one frame would show how well its errors are known, and not the pattern.
-    """
+    """Standard deviation (ny, nx) of the pattern over the pixels of a ring."""
+    # <v_a v_b> = width^2, because the noise of different frames is independent; squares of one
+    # frame would show, where noise dominates, how well its errors are known. Where it does,
+    # var(v_a v_b) = variance_a variance_b.
     ring = away.astype(np.int64)
     count = ring.max() + 1
     total, weight = np.zeros(count), np.zeros(count)

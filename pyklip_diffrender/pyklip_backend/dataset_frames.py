@@ -104,49 +104,32 @@ class SourceFrames:
     """The N frames of a JWST dataset before pyKLIP shifted them, in the order of the dataset.
 
     Frames that spaceKLIP has aligned are back on the pixels of the detector.
-
-    Attributes
-    ----------
-    headers : list of Header
-        One per frame: primary and SCI header merged.
-    data : ndarray, (N, ny, nx)
-        Pixels before resampling; NaN where the flags say NON_SCIENCE.
-    error : ndarray, (N, ny, nx), or None
-        Standard deviations from ERR, in the unit of `data`.
-    usable : ndarray of bool, (N, ny, nx)
-        False where a flag excludes the pixel from the fit.
-    centers : ndarray, (N, 2)
-        Star centres x, y in `data`, 0-indexed.
-    aligned : ndarray, (N, ny, nx)
-        Copy of ``dataset.input`` after reading: `data` shifted by pyKLIP.
-    aligned_centers : ndarray, (N, 2)
-        Copy of ``dataset.centers`` after reading.
-    filenames : tuple of str
-        ``dataset.filenames`` after reading.
-    first_pixels : list of (int, int) or None
-        Detector column and row of the first pixel of every frame, where known.
-    star_offsets : list of (float, float) or None
-        x, y of the star from the occulter as the file says, arcsec, where it does.
-    paths : list of Path
-        The file of every frame.
-    files : dict of Path to FrameFile
-        The files, as they were read.
-    sequence : Sequence or None
-        The sequence that the files were sorted into, if they were before pyKLIP read them.
     """
 
+    # One of each per frame: primary and SCI header merged.
     headers: list[fits.Header]
+    # (N, ny, nx), before resampling; NaN where the flags say NON_SCIENCE.
     data: NDArray[np.floating[Any]]
+    # (N, ny, nx), standard deviations from ERR in the unit of `data`.
     error: NDArray[np.float64] | None
+    # (N, ny, nx), False where a flag excludes the pixel from the fit.
     usable: NDArray[np.bool_]
+    # (N, 2), x, y of the star in `data`, 0-indexed.
     centers: NDArray[np.float64]
+    # (N, ny, nx), copy of ``dataset.input`` after reading: `data` shifted by pyKLIP.
     aligned: NDArray[np.floating[Any]]
+    # (N, 2), copy of ``dataset.centers`` after reading.
     aligned_centers: NDArray[np.float64]
+    # ``dataset.filenames`` after reading.
     filenames: tuple[str, ...]
+    # Detector column and row of the first pixel of every frame, where known.
     first_pixels: list[tuple[int, int] | None]
+    # x, y of the star from the occulter as the file says, arcsec, where it does.
     star_offsets: list[tuple[float, float] | None]
+    # The file of every frame.
     paths: list[Path]
     files: dict[Path, FrameFile]
+    # What the files were sorted into, if they were judged before pyKLIP read them.
     sequence: Sequence | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
@@ -194,12 +177,7 @@ def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
 def attach_source(dataset: Any, files: Any = None) -> None:
     """Attach a `SourceFrames` to a `JWSTData` that was read before `register`, if possible.
 
-    Parameters
-    ----------
-    dataset : pyklip.instruments.Instrument.Data
-    files : path or sequence of path, optional
-        Files or folders in which the dataset's files are looked for by name, beside the current
-        folder.
+    Its files are looked for by name in `files` (files or folders) and in the current folder.
     """
     if hasattr(dataset, ATTRIBUTE) or hasattr(dataset, REASON) or not _reads_files(dataset):
         return
@@ -247,18 +225,8 @@ def read_source(
 ) -> SourceFrames:
     """Read the pixels, errors, flags and headers of the files of a `JWSTData`.
 
-    Parameters
-    ----------
-    dataset : JWSTData
-    filepaths : str or iterable of str
-    late : bool
-        The dataset was not just filled: its frames may have been changed, left out or reordered
-        since, so that all frames are shifted again.
-
-    Raises
-    ------
-    ValueError
-        If shifting these pixels as pyKLIP does not reproduce ``dataset.input``.
+    With `late` its frames may have been changed, left out or reordered since it was read, so that
+    all are shifted again. Raises ValueError if shifting as pyKLIP does not give ``dataset.input``.
     """
     from pyklip.klip import align_and_scale
 
@@ -324,8 +292,8 @@ class _File(NamedTuple):
     centers: NDArray[np.float64]
     first_pixel: tuple[int, int] | None
     star_offset: tuple[float, float] | None
+    # The frames, and their star's x, y, as pyKLIP reads them.
     as_read: NDArray[Any]
-    """The frames, and their star's x, y, as pyKLIP reads them."""
     center_read: NDArray[np.float64]
 
 
@@ -341,13 +309,7 @@ class OpenedFile(NamedTuple):
 
     @classmethod
     def at(cls, path: str | os.PathLike[str]) -> OpenedFile:
-        """Open a file, once.
-
-        Raises
-        ------
-        CorruptFileError, KeyError
-            If it cannot be read, or has no SCI extension.
-        """
+        """Open a file, once; raises CorruptFileError, and KeyError without a SCI extension."""
         where = Path(path).absolute()
         with open_fits(where) as hdus:
             return cls(
@@ -462,8 +424,8 @@ class Recorded(NamedTuple):
     data: NDArray[np.float64]
     valid: NDArray[np.bool_]
     error: NDArray[np.float64] | None
-    centers: NDArray[np.float64]
-    factor: NDArray[np.float64]
+    centers: NDArray[np.float64]  # (n, 2), x, y
+    factor: NDArray[np.float64]  # (n,), of the dataset's frames over the recorded ones
 
 
 def recorded_frames(
@@ -473,12 +435,10 @@ def recorded_frames(
     index: NDArray[np.intp],
     imgs: NDArray[np.float64],
 ) -> Recorded:
-    """Recorded pixels plus what was added to `imgs` since reading, in the unit of the files.
+    """Recorded pixels plus what was added to `imgs` (n, ny, nx) since reading, in the files' unit.
 
-    Raises
-    ------
-    NotRecordedError
-        If no recorded pixels correspond to those of the dataset.
+    `index` and `places` (n,) say where the frames are in the dataset and, of all its frames, in
+    `source`. Raises NotRecordedError if no recorded pixels correspond to those of the dataset.
     """
     from pyklip.klip import align_and_scale
 
@@ -490,6 +450,9 @@ def recorded_frames(
             f"its frames have {imgs.shape[2]} x {imgs.shape[1]} pixels, and had {nx} x {ny} when "
             "they were read"
         )
+    # pyKLIP's frames are now = factor * (S recorded + added), where S shifts the star to the middle
+    # of the array. So added = now / factor - S recorded, and the fit takes recorded + S^-1 added,
+    # where S^-1 shifts it back: only what was added has been interpolated, and not the noise.
     rows = places[index]
     before = native_float64(source.aligned[rows])
     factor = np.array([_factor(one, other) for one, other in zip(imgs, before, strict=True)])
@@ -518,12 +481,9 @@ def recorded_frames(
 
 
 def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
-    """Factor by which a frame was multiplied since it was read; 1 if it was not.
+    """Factor by which a frame (ny, nx) was multiplied since it was read; 1 if it was not.
 
-    Raises
-    ------
-    NotRecordedError
-        If it is not positive.
+    Raises NotRecordedError if it is not positive.
     """
     known = np.isfinite(before) & np.isfinite(now)
     if not known.any():
@@ -532,6 +492,8 @@ def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
         bright = known & (np.abs(before) > np.percentile(np.abs(before[known]), 90))
     if not bright.any():
         return 1.0
+    # A frame that was only multiplied has one ratio in all its brightest pixels, to the rounding of
+    # single precision. Where the ratios scatter by more, something else was done to it.
     ratios = now[bright] / before[bright]
     factor = float(np.median(ratios))
     # Sources that were added since change few of the brightest pixels.
@@ -547,14 +509,9 @@ def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
 def _require_same(
     change: NDArray[np.float64], error: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> None:
-    """Refuse frames in which most pixels were changed by more than their noise.
-
-    Faint sources change few pixels, and another background changes all by the same amount.
-
-    Raises
-    ------
-    NotRecordedError
-    """
+    """Raise NotRecordedError if most pixels of a frame (ny, nx) changed by more than the noise."""
+    # Faint sources change few pixels, and another background changes all by the same amount:
+    # neither moves the median distance from the median.
     for frame, sigma, good in zip(change, error, usable, strict=True):
         known, scale = frame[np.isfinite(frame)], sigma[good & (sigma > 0)]
         if not known.size or not scale.size:
@@ -571,25 +528,14 @@ def _require_same(
 
 
 class Admitted(NamedTuple):
-    """Frames of a dataset that are used, and what else its files say.
+    """Frames of a dataset that are used, and what else its files say."""
 
-    Attributes
-    ----------
-    target : ndarray of bool, (n,)
-        Frames of the target.
-    references : tuple of Observation
-        Of reference stars, from the dataset and the library.
-    """
-
-    target: NDArray[np.bool_]
-    references: tuple[Observation, ...]
+    target: NDArray[np.bool_]  # (n,), frames of the target
+    references: tuple[Observation, ...]  # of reference stars, from the dataset and the library
 
 
 def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
-    """Files of the frames in a PSF library, as far as they are known.
-
-    Only a library that `JWSTData` read while the backend was registered has files.
-    """
+    """Files of a PSF library's frames, if `JWSTData` read it while the backend was registered."""
     paths = [Path(path) for path in getattr(dataset, REFERENCES, ())]
     chosen = np.asarray(psf_library.master_filenames)
     if psf_library.isgoodpsf is not None:
@@ -600,27 +546,11 @@ def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
 
 
 def admit(source: SourceFrames, frames: NDArray[np.intp], library: abc.Sequence[Path]) -> Admitted:
-    """Judge the files of frames of one filter, and those of the library.
+    """Judge the files of `frames`, indices in `source`, of one filter, and those of the library.
 
-    The target is the star of the first frame that is not marked as a reference (IS_PSF).
-
-    Parameters
-    ----------
-    source : SourceFrames
-    frames : ndarray of int
-        Indices in `source`.
-    library : sequence of Path
-        Files of reference stars.
-
-    Raises
-    ------
-    IncompatibleSetupError, NoValidPixelsError
-        See `pyklip_diffrender.Sequence.from_files`.
-
-    Warns
-    -----
-    DiffrenderWarning
-        For every file that is not used, or not entirely, with the reason.
+    The target is the star of the first frame that is not marked as a reference (IS_PSF). Raises as
+    `pyklip_diffrender.Sequence.from_files`, and warns of every file that is not used, or not
+    entirely.
     """
     paths = [source.paths[k] for k in frames]
     sequence = source.sequence
@@ -690,18 +620,10 @@ class FrameDetails(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Pointing:
-    """Frames that show the star at one place and orientation.
+    """Frames that show the star at one place and orientation."""
 
-    Attributes
-    ----------
-    frames : ndarray of int
-        Their indices among the fitted frames.
-    observation : Observation
-        These frames, with the header of the first.
-    """
-
-    frames: NDArray[np.intp]
-    observation: Observation
+    frames: NDArray[np.intp]  # their indices among the fitted frames
+    observation: Observation  # these frames, with the header of the first
 
     def __repr__(self) -> str:
         return f"<Pointing: frames {', '.join(map(str, self.frames))} of {self.observation.name!r}>"
@@ -723,17 +645,10 @@ def part_of(observation: Observation, which: NDArray[np.intp] | NDArray[np.bool_
 def pointings_of(
     observation: Observation, details: abc.Sequence[FrameDetails] | None = None
 ) -> list[Pointing]:
-    """Sort the frames of an observation by file and by where they show the star.
+    """Sort the frames of an observation by file and by place of the star, in order of time.
 
-    The rule is that of `Observation.pointings`. As in a `Sequence`, the pointings are in order of
-    time.
-
-    Parameters
-    ----------
-    observation : Observation
-        Several pointings.
-    details : sequence of FrameDetails, optional
-        One for each frame; by default all frames are as if from one file.
+    The rule is that of `Observation.pointings`. Without `details`, one for each frame, all frames
+    are as if from one file.
     """
     known = observation.position_angles
     if details is None:
@@ -775,36 +690,23 @@ def _at_one_place(observation: Observation, group: NDArray[np.intp]) -> Observat
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The target's frames of one wavelength that have any pixel to fit.
-
-    Attributes
-    ----------
-    observation : Observation
-        These frames, with errors and masks.
-    data : ndarray, (m, ny, nx)
-        Their pixels. Unlike in `observation`, flagged pixels keep their values.
-    usable : ndarray of bool, (n,)
-        Mask of these frames among those requested.
-    pixels : str
-        "recorded", or "as given" for the pixels of ``dataset.input``.
-    noise : str
-        Origin of the errors: "ERR", "given" or "estimated".
-    pointings : tuple of Pointing
-        Frames of the target, grouped by star position and orientation.
-    references : tuple of Observation
-        Frames of reference stars in the dataset and the library, by pointing.
-    factor : ndarray, (m,)
-        By which the frames of ``dataset.input`` were multiplied since they were read; `data` and
-        `observation` have the unit of the files.
-    """
+    """The m of n requested frames, of the target at one wavelength, that have any pixel to fit."""
 
     observation: Observation
+    # (m, ny, nx). Unlike in `observation`, flagged pixels keep their values.
     data: NDArray[np.float64]
+    # (n,), mask of these frames among those requested.
     usable: NDArray[np.bool_]
+    # "recorded", or "as given" for the pixels of ``dataset.input``.
     pixels: str
+    # Origin of the errors: "ERR", "given" or "estimated".
     noise: str
+    # Frames of the target, by position of the star and orientation.
     pointings: tuple[Pointing, ...] = ()
+    # Frames of reference stars in the dataset and the library, by pointing.
     references: tuple[Observation, ...] = ()
+    # (m,), by which the frames of ``dataset.input`` were multiplied since they were read; `data`
+    # and `observation` have the unit of the files.
     factor: NDArray[np.float64] = field(default_factory=lambda: np.ones(1))
 
     def __repr__(self) -> str:
@@ -897,34 +799,11 @@ def frames_of(
 ) -> Frames:
     """Gather the target's frames of one wavelength with their errors, masks and metadata.
 
-    Frames from files are judged by header and pixels, see `admit`; those that are not used stay NaN
-    in the products.
-
-    Parameters
-    ----------
-    dataset : pyklip.instruments.Instrument.Data
-        The dataset that the frames belong to.
-    index : ndarray, (n,)
-        Their indices in the dataset.
-    imgs : ndarray, (n, ny, nx)
-        The frames, as in ``dataset.input`` before any high-pass filter.
-    settings : DiffrenderSettings
-        Its `error`, `unit`, `pixelscale` and `filter` replace those of the dataset.
-    library : sequence of Path
-        Files of reference stars.
-
-    Raises
-    ------
-    NoValidPixelsError
-        If no frame has a valid pixel.
-    IncompatibleSetupError
-        If the files cannot be reduced together.
-
-    Warns
-    -----
-    DiffrenderWarning
-        For every file that is not used, or not entirely, with the reason.
+    `imgs` (n, ny, nx) are those at `index` of ``dataset.input``, before any high-pass filter. Those
+    that `admit` excludes stay NaN in the products. Raises NoValidPixelsError if no frame has a
+    valid pixel.
     """
+    # Frames of reference stars may be among the dataset's: all are gathered, then the files judged.
     every = _gather(dataset, index, imgs, settings)
     observation, chosen = every.observation, index[every.usable]
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
@@ -965,13 +844,7 @@ def frames_of(
 def _gather(
     dataset: Any, index: NDArray[np.intp], imgs: NDArray[Any], settings: DiffrenderSettings
 ) -> Frames:
-    """Gather all frames of one wavelength, of whatever star.
-
-    Warns
-    -----
-    DiffrenderWarning
-        If the files' pixels, errors, flags or headers cannot be used.
-    """
+    """Gather all frames of one wavelength, of whatever star; warns if the files are of no use."""
     imgs = native_float64(imgs)
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
     data, valid, error = imgs, np.isfinite(imgs), None
@@ -999,6 +872,7 @@ def _gather(
             stacklevel=2,
         )
     if settings.error is not None:
+        # Frames have the unit of the files by now, and given errors that of the dataset.
         error = _broadcast(settings.error, index, dataset.input.shape) / factor[:, None, None]
         noise = "given"
     elif error is None:
@@ -1057,12 +931,12 @@ def _broadcast(error: Any, index: NDArray[np.intp], shape: tuple[int, ...]) -> N
 
 
 def _estimate(data: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scatter of the differences between neighbouring pixels, one number per frame.
-
-    Speckles count as noise.
-    """
+    """Scatter of the differences between neighbouring pixels of each frame, as (n, ny, nx)."""
     error = np.empty_like(data)
     for frame, out in zip(data, error, strict=True):
+        # A difference of two pixels has sqrt(2) times their error, and the median of |x| of a
+        # Gaussian is sigma / 1.4826. Neighbours share the smooth light of the star; its speckles
+        # count as noise.
         steps = np.diff(frame, axis=1)
         steps = np.abs(steps[np.isfinite(steps)])
         sigma = 1.4826 / np.sqrt(2) * float(np.median(steps)) if steps.size else 0.0

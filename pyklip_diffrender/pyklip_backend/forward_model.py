@@ -50,26 +50,17 @@ _APERTURE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class PlanetInFrame:
-    """The planet in one frame, with the star's fit.
+    """The planet in one frame, with the star's fit."""
 
-    Attributes
-    ----------
-    left : ndarray, (ny, nx)
-        Forward model on the pixels of the frame; NaN where there is no model.
-    center : ndarray, (2,)
-        x, y of the star in the frame.
-    taken : float
-        Largest change of the star because of the planet over the standard deviation of the star.
-    offset : ndarray, (2,)
-        x, y of the planet in pixels from the star.
-    contrast : float
-        Light of the planet over that of the star.
-    """
-
+    # (ny, nx), forward model on the pixels of the frame; NaN where there is no model.
     left: NDArray[np.float64]
+    # (2,), x, y of the star in the frame.
     center: NDArray[np.float64]
+    # Largest change of the star because of the planet, over the standard deviation of the star.
     taken: float
+    # (2,), x, y of the planet in pixels from the star.
     offset: NDArray[np.float64]
+    # Light of the planet over that of the star.
     contrast: float
 
 
@@ -81,12 +72,7 @@ def is_planet(fm_class: Any) -> bool:
 
 
 def check_forward_model(fm_class: Any, settings: DiffrenderSettings) -> None:
-    """Raise for an object of `pyklip.fmlib` that is not supported with these settings.
-
-    Raises
-    ------
-    IncompatibleSetupError
-    """
+    """Raise IncompatibleSetupError for an object of `pyklip.fmlib` that is not supported."""
     from pyklip.fmlib.nofm import NoFM
 
     if type(fm_class) is NoFM:
@@ -119,35 +105,12 @@ def planet_in_frames(
     flipx: bool,
     filtered: Filter | None = None,
 ) -> dict[int, PlanetInFrame]:
-    """The forward model of a planet in all frames of one wavelength.
+    """Forward model of a planet in the frames of one wavelength, by place in `frames`, unfiltered.
 
-    Parameters
-    ----------
-    fm_class : pyklip.fmlib.fmpsf.FMPlanetPSF
-        The planet: separation in pixels, position angle, flux, and the user's PSF.
-    pointings : sequence of FittedPointing
-    frames : ndarray of int
-        Indices in the dataset of the fitted frames.
-    angles : ndarray
-        Angles in degrees by which pyKLIP turns the frames counter-clockwise.
-    wavelength : float
-        As in ``dataset.wvs``.
-    flipx : bool
-        See `pyklip.klip.rotate`.
-    filtered : callable, optional
-        High-pass filter of a frame, which the user's PSF has been through.
-
-    Returns
-    -------
-    dict of int to PlanetInFrame
-        By place in `frames`; not filtered.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the planet is outside the frames, or the user's PSF has no light.
-    RefinementError
-        If a fit has no linear model.
+    `fm_class` (`FMPlanetPSF`) has the planet and the user's PSF, which has been through `filtered`.
+    `frames` (n,) are the dataset's indices of the fitted frames, which pyKLIP turns by `angles` in
+    degrees counter-clockwise (`flipx` as in `pyklip.klip.rotate`). Raises RefinementError without a
+    linear model.
     """
     planets = {}
     for result in dict.fromkeys(pointing.result for pointing in pointings):
@@ -163,6 +126,9 @@ def planet_in_frames(
             )
             for part in parts
         ]
+        # The frames of a pointing were averaged for the fit, so that the star has changed by the
+        # image of the mean planet. It is subtracted from every frame; the planet keeps the factor
+        # that `FMPlanetPSF` gives it in each.
         factors = [
             _light(fm_class, frames[part.pointing.frames], wavelength) * source.scale
             for part, source in zip(parts, sources, strict=True)
@@ -181,7 +147,7 @@ def planet_in_frames(
 
 
 def _light(fm_class: Any, frames: NDArray[np.intp], wavelength: float) -> NDArray[np.float64]:
-    """Factor of the user's PSF in every frame, as `FMPlanetPSF` computes it."""
+    """Factor (n,) of the user's PSF in every frame, as `FMPlanetPSF` computes it."""
     spectrum = np.ravel(fm_class.spectrallib[0])
     number = np.abs(np.ravel(fm_class.input_psfs_wvs) - wavelength).argmin()
     conversion = np.asarray(fm_class.flux_conversion, dtype=float)[frames]
@@ -190,20 +156,13 @@ def _light(fm_class: Any, frames: NDArray[np.intp], wavelength: float) -> NDArra
 
 @dataclass(frozen=True, eq=False)
 class _PlanetImage:
-    """A planet in one pointing.
+    """A planet in one pointing."""
 
-    Attributes
-    ----------
-    offset : ndarray, (2,)
-        x, y in pixels from the star.
-    image : ndarray, (ny, nx)
-        Image of the planet in the frames, as bright as the star; NaN where there is no model.
-    scale : float
-        Light of the user's PSF over that of `image`.
-    """
-
+    # (2,), x, y in pixels from the star.
     offset: NDArray[np.float64]
+    # (ny, nx), the planet in the frames, as bright as the star; NaN where there is no model.
     image: NDArray[np.float64]
+    # Light of the user's PSF over that of `image`.
     scale: float
 
     @classmethod
@@ -216,7 +175,13 @@ class _PlanetImage:
         flipx: bool,
         filtered: Filter | None,
     ) -> _PlanetImage:
-        """Place the planet, and compare its image with the user's PSF at the same place."""
+        """Place the planet, and compare its image with the user's PSF at the same place.
+
+        `angle` is in degrees counter-clockwise, by which pyKLIP turns the frames.
+        """
+        # From +x towards +y the planet is at 90 degrees + PA in the product, where east is to the
+        # left, so at 90 - PA before a flip of x; pyKLIP has turned it there counter-clockwise by
+        # `angle`.
         direction = np.radians(90.0 + (-1 if flipx else 1) * fm_class.pa - angle)
         offset = fm_class.sep * np.array([np.cos(direction), np.sin(direction)])
         window, center = part.window, part.frame.observation.center[0]
@@ -235,6 +200,8 @@ class _PlanetImage:
             group.center[0] + margin, angle, wavelength, flipx, [0],
         )  # fmt: skip
         users = users.reshape(shape)[margin:-margin, margin:-margin]
+        # The scale makes the rendered planet as bright as the user's PSF, both filtered alike: the
+        # sums of their light within four lambda/D are equal.
         image = part.paste(part.source(offset, part.box), part.box)
         ours = np.nan_to_num(image)
         if filtered is not None:
@@ -261,9 +228,11 @@ def _change_of_star(
     sources: Sequence[_PlanetImage],
     factors: Sequence[float],
 ) -> list[NDArray[np.float64]]:
-    """Light of the planet that the fit takes for star, on the fitted square of every pointing."""
+    """Light of the planet that the fit takes for star, (ny, nx) on each fitted square."""
     if _is_companion(result, parts[0], sources[0]):
         return [np.zeros(part.window.shape) for part in parts]
+    # s = J H^-1 G p, the image in every frame of the change of the unknowns to which the planet's
+    # light p in all frames leads; see `linear.model`.
     templates = {
         part.index: torch.from_numpy(factor * part.source(source.offset, part.window))[None]
         for part, source, factor in zip(parts, sources, factors, strict=True)
@@ -299,24 +268,10 @@ def planet_cards(
 ) -> fits.Header:
     """Flux and position of a planet with their errors, as cards for the products.
 
-    Parameters
-    ----------
-    part : FittedPointing
-        The pointing of the fit's first frame.
-    planet : PlanetInFrame
-        The forward model there.
-    angle : float
-        Degrees counter-clockwise by which pyKLIP turns the pointing.
-    flipx : bool
-        See `pyklip.klip.rotate`.
-    error_factor : ErrorFactor, optional
-        By how much the errors are too small. By default it is measured with the planet, and the
-        companions of the fit, removed.
-
-    Returns
-    -------
-    Header
-        Empty if no source is within lambda/D of the planet's place in the forward model.
+    `part` is the pointing of the fit's first frame and `planet` the forward model there; pyKLIP
+    turns it by `angle` in degrees counter-clockwise. Empty if no source is within lambda/D of the
+    planet's place. The factor of the errors is, by default, measured with planet and companions
+    removed.
     """
     from pyklip_diffrender.detection.candidates import (
         Candidates,
@@ -327,6 +282,8 @@ def planet_cards(
     from pyklip_diffrender.detection.search import default_factor
     from pyklip_diffrender.detection.templates import groups_of
 
+    # A companion of the fit within lambda/D is the planet itself: it makes room for one with the
+    # place and flux of the forward model, the last of the sources, which are then fitted together.
     cards = fits.Header()
     start, resolution = part.from_star(planet.offset), part.resolution
     others = Candidates.of_fit(part.result)
@@ -343,6 +300,7 @@ def planet_cards(
         _log.info("no source within lambda/D of the planet of the forward model")
         return cards
     sources = with_position_of_star(groups, sources)
+    # Rows and columns are contrasts, then x, then y, of all sources: of the last these are 3 x 3.
     covariance = sources.covariance.numpy().reshape(3, len(sources), 3, len(sources))[:, -1, :, -1]
     if error_factor is None:
         error_factor = default_factor([part.result], groups, sources)
@@ -361,6 +319,7 @@ def planet_cards(
     jacobian = turn @ pixels
     deviations = factor * np.sqrt(np.diag(jacobian @ covariance[1:, 1:] @ jacobian.T))
     set_keyword(cards, "DRFMFLUX", flux)
+    # Noise and the relative error of the image of the source are independent.
     flux_error = float(np.hypot(error / planet.contrast, flux * calibration))
     set_keyword(cards, "DRFMFERR", flux_error)
     set_keyword(cards, "DRFMFACT", factor)
@@ -411,21 +370,13 @@ class ForwardReduction(DatasetReduction):
         *args: Any,
         **kw: Any,
     ) -> tuple[Any, ...]:
-        """Replace `pyklip.fm.klip_parallelized`.
+        """Replace `pyklip.fm.klip_parallelized`, with the same results.
 
-        Returns
-        -------
-        sub_imgs : ndarray
-            (b, n, ny, nx), turned to north; one equal slice for each entry of numbasis.
-        fmout : ndarray or None
-            The planet in them, likewise.
-        perturbmag : ndarray or None
-            (n, b) largest change of the star because of the planet, over the standard deviation of
-            the star.
-        aligned_center : sequence
-            [x, y] of their common centre.
-        noise : ndarray
-            (b, n, ny, nx) if requested, else ``[1.]``.
+        They are sub_imgs, fmout, perturbmag, the common centre (x, y), and noise. The first two are
+        (b, n, ny, nx), turned to north: one equal slice for each of the b entries of numbasis.
+        perturbmag is (n, b), the largest change of the star because of the planet over the standard
+        deviation of the star. Without a planet, it and fmout are None. Noise is (b, n, ny, nx) if
+        requested, else ``[1.]``.
         """
         unturned, center, noise = self._klip_parallelized(
             opd, imgs, centers, parangs, wvs, np.arange(len(imgs)), IWA, **kw
@@ -458,10 +409,7 @@ class ForwardReduction(DatasetReduction):
         center: NDArray[np.float64],
         flipx: bool,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The planet in all frames (n, ny, nx), star at `center`, and how much the star took.
-
-        Its image goes through all steps that the frames went through.
-        """
+        """The planet in all frames (n, ny, nx), star at `center`, and how much the star took."""
         from pyklip.klip import align_and_scale
 
         self._tell("forward model of the planet")
@@ -477,6 +425,7 @@ class ForwardReduction(DatasetReduction):
                 flipx,
                 self._filter,
             )
+            # The cards are of one flux and position, so of one wavelength.
             if len(self.records) == 1:
                 first = next(part for part in record.subtraction.pointings if part.index == 0)
                 k, reduction = int(first.pointing.frames[0]), record.subtraction.reduction

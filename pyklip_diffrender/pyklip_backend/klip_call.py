@@ -84,19 +84,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Annuli:
-    """The annuli that pyKLIP would use, reduced to what matters without KLIP.
+    """The annuli that pyKLIP would use, reduced to what matters without KLIP."""
 
-    Attributes
-    ----------
-    inner, outer : float
-        Pixels; r < inner and r >= outer are NaN in a product.
-    width : float
-        Width in pixels of the narrowest annulus, over which pyKLIP measures noise.
-    """
-
-    inner: float
+    inner: float  # pixels; r < inner and r >= outer are NaN in a product
     outer: float
-    width: float
+    width: float  # pixels, of the narrowest annulus, over which pyKLIP measures noise
 
 
 def annuli_of(
@@ -107,25 +99,19 @@ def annuli_of(
     annuli: int | Sequence[tuple[float, float]],
     spacing: str,
 ) -> Annuli:
-    """Find the annuli of frames (n, ny, nx) by pyKLIP's rules.
+    """Find the annuli of frames (n, ny, nx), star at x, y = `centers` (n, 2), by pyKLIP's rules.
 
-    Parameters
-    ----------
-    imgs : ndarray, (n, ny, nx)
-    centers : ndarray, (n, 2)
-        Star centres x, y.
-    inner, outer : float
-        IWA and OWA in pixels; `outer` is None for the whole image.
-    annuli : int or sequence of (inner, outer)
-        Number of annuli, or their radii in pixels.
-    spacing : str
-        "constant", "log" or "linear".
+    `inner` and `outer` are IWA and OWA in pixels, `outer` None for the whole image. `annuli` is a
+    number or a sequence of radii (inner, outer) in pixels; `spacing` is "constant", "log" or
+    "linear".
     """
     from pyklip.klip import define_annuli_bounds
 
     if np.ndim(annuli):
         inners, outers = np.array(annuli, dtype=float).reshape(-1, 2).T
         return Annuli(inners.min(), outers.max(), (outers - inners).min())
+    # Without OWA, pyKLIP takes the distance of the nearest NaN pixels, or of the corners, to divide
+    # the annuli, but lets the last one reach over the whole image.
     edge = outer
     if edge is None:
         y, x = np.indices(imgs.shape[1:])
@@ -139,23 +125,12 @@ def annuli_of(
 
 
 def fill(residual: NDArray[np.float64], good: NDArray[np.bool_]) -> int:
-    """Replace flagged pixels by the median of their good neighbours, in place.
+    """Replace pixels of frame minus star (ny, nx) that are not `good` by their neighbours' median.
 
-    Otherwise the spline that shifts and rotates frames would spread each bad pixel over a dozen
-    others. NaN pixels stay NaN; a flagged pixel without a good one within two pixels becomes NaN.
-
-    Parameters
-    ----------
-    residual : ndarray, (ny, nx)
-        Frame minus star.
-    good : ndarray of bool, (ny, nx)
-        False for flagged pixels.
-
-    Returns
-    -------
-    int
-        Number of pixels replaced.
+    In place; returns the number of pixels. Only good neighbours count: a pixel that has none within
+    two pixels becomes NaN. NaN pixels stay NaN.
     """
+    # The spline that shifts and rotates frames would spread each bad pixel over a dozen others.
     trusted = np.where(good, residual, np.nan)
     flagged = np.argwhere(~good & np.isfinite(residual))
     for y, x in flagged:
@@ -174,10 +149,9 @@ def place(
     new_center: NDArray[np.float64],
     annuli: Annuli,
 ) -> NDArray[np.float64]:
-    """Shift a subtracted frame to the common centre, mask it, and subtract its pedestal.
+    """Shift frame minus star (ny, nx) from star x, y `old_center` to `new_center`, and mask it.
 
-    The pedestal is the sigma-clipped median, which companions do not change. KLIP makes the mean
-    of each section zero, and code that reads its products relies on that.
+    The sigma-clipped median is subtracted.
     """
     from pyklip.klip import align_and_scale
 
@@ -187,6 +161,8 @@ def place(
     placed[(r < annuli.inner) | (r >= annuli.outer)] = np.nan
     kept = np.isfinite(placed)
     if kept.any():
+        # Companions do not change a clipped median. KLIP makes the mean of each section zero, and
+        # code that reads its products relies on that.
         placed -= sigma_clipped_stats(placed[kept])[1]
     return placed
 
@@ -197,11 +173,8 @@ def _number_type(dtype: Any) -> np.dtype[Any]:
 
 
 def slices(frames: NDArray[np.float64], count: int, dtype: Any) -> NDArray[Any]:
-    """Repeat frames (n, ny, nx) in pyKLIP's number type: (count, n, ny, nx).
-
-    Without a KL cut-off there is one result, but pyKLIP's later steps expect one slice for each
-    entry of numbasis.
-    """
+    """Repeat frames (n, ny, nx) in pyKLIP's number type, for numbasis: (count, n, ny, nx)."""
+    # Without a KL cut-off there is one result, but pyKLIP's later steps expect a slice per entry.
     return np.repeat(frames.astype(_number_type(dtype))[np.newaxis], count, axis=0)
 
 
@@ -228,12 +201,7 @@ def aligned_before(
     center: NDArray[np.float64],
     dtype: Any,
 ) -> NDArray[Any]:
-    """Unsubtracted frames for save_aligned: centred, and scaled to each of the wavelengths.
-
-    Returns
-    -------
-    ndarray, (wavelengths, n, ny, nx)
-    """
+    """Frames for save_aligned, centred, and scaled to each wavelength: (wavelengths, n, ny, nx)."""
     from pyklip.klip import align_and_scale
 
     return np.array(
@@ -333,23 +301,16 @@ _SAME_PLACE = 0.01
 
 
 def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
-    """The star in copies of reduced frames, which differ by faint sources.
+    """The star in copies of the frames of `record`, which differ by faint sources.
 
-    Parameters
-    ----------
-    record : ReductionRecord
-        Of the frames without the sources.
-    frames : Frames
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If these are other frames, or their fit has no linear model.
+    Raises IncompatibleSetupError if these are other frames, or their fit has no linear model.
     """
     _require_copy(record, frames)
     before = record.subtraction
     added = frames.data - record.frames.data
     star = before.star.copy()
+    # Star of the copy = star + J H^-1 G (added light), where every pointing has the added light
+    # that the fit would have averaged. Outside the fitted square only the background changes.
     for result in dict.fromkeys(part.result for part in before.pointings):
         parts = [part for part in before.pointings if part.result is result]
         light = {}
@@ -398,12 +359,7 @@ _FILTERED = "_diffrender_filtered"
 class DatasetReduction:
     """A call of `klip_dataset` with ``algo="diffrender"``.
 
-    Parameters
-    ----------
-    arguments : mapping
-        All arguments of the call, defaults included.
-    settings : DiffrenderSettings
-        Merged settings of the call, the dataset and the registration.
+    `arguments` are all of the call, defaults included; `settings` are merged.
     """
 
     def __init__(self, arguments: Mapping[str, Any], settings: DiffrenderSettings) -> None:
@@ -417,16 +373,9 @@ class DatasetReduction:
     def run(self, klip_dataset: Callable[..., Callable[..., None]]) -> None:
         """Do the whole call, or raise and leave dataset and output folder as they were.
 
-        Parameters
-        ----------
-        klip_dataset : callable
-            Takes replacements for functions of pyKLIP's module by name, and returns pyKLIP's
-            `klip_dataset` using these; see `PatchedFunction.original`.
-
-        Raises
-        ------
-        DiffrenderError
-            For bad input and failed fits. pyKLIP's own errors pass through.
+        `klip_dataset` takes replacements for functions of pyKLIP's module by name, and returns the
+        `klip_dataset` that uses them; see `PatchedFunction.original`. Raises DiffrenderError, and
+        pyKLIP's own errors.
         """
         before, names = dict(vars(self.dataset)), self.dataset.filenames
         try:
@@ -548,18 +497,11 @@ class DatasetReduction:
         IWA: float,
         **kw: Any,
     ) -> tuple[Any, ...]:
-        """Replace `pyklip.parallelized.klip_parallelized`.
+        """Replace `pyklip.parallelized.klip_parallelized`, with the same results.
 
-        Returns
-        -------
-        sub_imgs : ndarray
-            (b, n, ny, nx), one equal slice for each of the b entries of numbasis.
-        aligned_center : sequence
-            [x, y] of their common centre.
-        noise : ndarray
-            (b, n, ny, nx) if requested, else ``[1.]``.
-        aligned : ndarray
-            (wavelengths, n, ny, nx) unsubtracted frames, if requested.
+        They are sub_imgs (b, n, ny, nx), one equal slice for each of the b entries of numbasis; x,
+        y of the common centre; noise, (b, n, ny, nx) if requested, else ``[1.]``; and, if
+        requested, the unsubtracted frames (wavelengths, n, ny, nx).
         """
         index = np.flatnonzero(np.isin(self.dataset.wvs, np.unique(wvs)))
         center = kw.get("aligned_center")
@@ -607,6 +549,7 @@ class DatasetReduction:
         """
         if self._before_injection:
             return
+        # The throughput follows from the linear model of one fit at each wavelength.
         results = [fit.result for record in self.records for fit in record.subtraction.fits]
         linear = all(getattr(result, "linear", None) is not None for result in results)
         if not linear or len(results) != len(self.records):
@@ -651,13 +594,7 @@ class DatasetReduction:
     def _subtract(
         self, frames: Frames, opd: OPDMap, settings: DiffrenderSettings
     ) -> NDArray[np.float64]:
-        """Subtract the star from frames; high-pass filtered if the call asks for it.
-
-        Returns
-        -------
-        ndarray, (m, ny, nx)
-            In the unit of ``dataset.input``.
-        """
+        """Frames minus star, (m, ny, nx) in ``dataset.input``'s unit, filtered if asked for."""
         observation = frames.observation
         before = self._before_injection
         if before:
@@ -695,6 +632,7 @@ class DatasetReduction:
             added = frames.data - original.frames.data if before else None
             original.images.put_into(residuals, image, added)
         self.records.append(record)
+        # The fit has the unit of the files; whoever multiplied the dataset gets it multiplied.
         residuals *= frames.factor[:, np.newaxis, np.newaxis]
         if self._filter is not None:
             residuals = np.array([self._filter(residual) for residual in residuals])
@@ -702,10 +640,7 @@ class DatasetReduction:
 
 
 def _say_on_screen(error: BaseException) -> None:
-    """Print an error while stderr goes to memory.
-
-    spaceKLIP does that while it injects sources, so that nobody would see what ended the program.
-    """
+    """Print an error while stderr goes to memory, as in spaceKLIP while it injects sources."""
     if isinstance(sys.stderr, io.StringIO) and sys.__stderr__ is not None:
         print(f"diffrender: {type(error).__name__}: {error}", file=sys.__stderr__)
 

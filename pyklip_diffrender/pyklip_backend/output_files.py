@@ -65,17 +65,9 @@ _IMAGES_AT_ONCE = 320
 
 
 def image_of(settings: DiffrenderSettings, subtraction: Subtraction) -> str:
-    """Return which image the products carry.
+    """Return which image the products carry, one of `IMAGES`.
 
-    Parameters
-    ----------
-    settings : DiffrenderSettings
-    subtraction : Subtraction
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the image that is asked for needs a linear model, and there is none.
+    Raises IncompatibleSetupError if it needs the linear model of a fit, and there is none.
     """
     fitted = bool(subtraction.pointings)
     real = fitted and all(
@@ -91,13 +83,7 @@ def image_of(settings: DiffrenderSettings, subtraction: Subtraction) -> str:
 
 
 class ProductImages:
-    """Images of what is not star in the fitted frames of one wavelength.
-
-    Parameters
-    ----------
-    subtraction : Subtraction
-        With the fits of its pointings.
-    """
+    """Images of what is not star in the fitted frames of one wavelength."""
 
     def __init__(self, subtraction: Subtraction) -> None:
         self.pointings = subtraction.pointings
@@ -138,26 +124,23 @@ class ProductImages:
 
     @cached_property
     def _extended(self) -> Image | None:
-        """The disk as the estimate of the sky would show it, which is made from frames without."""
+        """The disk, (ny, nx) north up, as the estimate of the sky without it would show it."""
         disk = self._disk
         if disk is None or not len(disk.offsets):
             return None
         angle = self.fits[0].frames[0].observation.position_angle
+        # A point of the disk of contrast c has c times the peak of a planet of contrast 1 at the
+        # nearest pixel; the estimate of the sky makes its image from that peak.
         away = disk.offsets[:, None] - self.maps.grid.reshape(-1, 2)
         pixels = np.hypot(*np.moveaxis(away, -1, 0)).argmin(axis=1)
         peaks = disk.contrasts * self._peaks.ravel()[pixels]
         return self.sky.of_sources(disk.offsets, peaks, angle)
 
     def put_into(self, residuals: Image, image: str, added: Image | None = None) -> None:
-        """Replace the fitted square of frames, (n, Ny, Nx), by an image of the sky, in place.
+        """Replace the fitted square of frames minus star (n, Ny, Nx) by an image of the sky.
 
-        Parameters
-        ----------
-        residuals : ndarray, (n, Ny, Nx)
-            Frames minus their star.
-        image : {"cleaned", "flux"}
-        added : ndarray, (n, Ny, Nx), optional
-            Light in copies of the frames that those of the fit do not have.
+        It is done in place. `added` is the light, (n, Ny, Nx), in copies of the frames that those
+        of the fit do not have.
         """
         sky = self._cleaned(added) if image == "cleaned" else self._flux(added)
         for part in self.pointings:
@@ -196,6 +179,9 @@ class ProductImages:
         """Peak of a point source at each pixel of the first frame, with the star marginalised."""
         numerator = self.maps.numerator
         if added is not None:
+            # Contrast = numerator / information, the inner products of a planet's image with data
+            # and with itself after the star is marginalised; the first is linear in light that is
+            # added.
             numerator = numerator + self.maps.change(self._added(added))[0]
         known = self.maps.information > 0
         contrast = np.divide(
@@ -251,24 +237,11 @@ _BATCH = 256
 def throughput_map(
     fit: Refinement, spacing: int = SPACING, inner: float = _INNER
 ) -> NDArray[np.float64]:
-    """Fraction of a faint source's peak that is left, on the pixels of the fit's first frame.
+    """Fraction (ny, nx) of a faint source's peak that is left, on the fit's first frame's pixels.
 
-    Companions of the fit are part of its model, so that no light at their places becomes star.
-
-    Parameters
-    ----------
-    fit : Refinement
-        With a linear model.
-    spacing : int
-        Pixels between the computed positions; next to the star and to companions every pixel is
-        computed.
-    inner : float
-        Pixels about the star within which every pixel is computed.
-
-    Returns
-    -------
-    ndarray, (ny, nx)
-        For sources at the pixel centres; the mean of all frames of the fit.
+    It is the mean of all frames of the fit, for sources at the middles of the pixels. It is
+    computed every `spacing` pixels, and at every pixel within `inner` pixels of the star and next
+    to companions.
     """
     from pyklip_diffrender.detection.templates import Templates
 
@@ -280,6 +253,8 @@ def throughput_map(
     every = np.moveaxis(np.indices((ny, nx)), 0, -1)
     filled = np.asarray(RegularGridInterpolator((rows, columns), coarse)(every))
     pixel = math.sqrt(math.prod(fit.model.detector.pixelscale))
+    # Interpolation errs where the throughput changes from pixel to pixel: near the star, and near
+    # companions, at whose places no light becomes star because they are part of the model.
     dense = np.hypot(*templates.grid.transpose(2, 0, 1)) <= inner * pixel
     for _, *offset in fit.companions:
         dense |= np.hypot(*(templates.grid - offset).transpose(2, 0, 1)) <= _DENSE * pixel
@@ -290,7 +265,7 @@ def throughput_map(
 def _at(
     fit: Refinement, templates: Templates, rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """The throughput of sources at pixels of the first frame."""
+    """The throughput (k,) of sources at pixels, rows and columns (k,), of the first frame."""
     star = np.array([unknown.name != "companions" for unknown in fit.linear.unknowns])
     left = np.empty(len(rows))
     for start in range(0, len(rows), _BATCH):
@@ -301,6 +276,8 @@ def _at(
         change[~star] = 0.0
         taken, total = np.zeros(len(offsets)), 0.0
         for k, image in images.items():
+            # 1 - g . change / g . p, see above. The frames of a pointing are averaged, so that its
+            # `count` of them weighs each.
             core = _cores(fit.frames[k].model, templates.pixels_of(k, offsets))
             peak = np.einsum("kyx,kyx->k", core, image.numpy())
             share = np.einsum("kyx,kyx->k", core, fit.linear.frames[k].image(change).numpy())
@@ -313,7 +290,7 @@ def _at(
 
 
 def _cores(model: OpticalSystem, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gaussians narrower than an image of a source, about rows and columns (2, k): (k, ny, nx)."""
+    """Gaussians (k, ny, nx) narrower than a source, about rows and columns `places` (2, k)."""
     detector = model.detector
     pixel = math.sqrt(math.prod(detector.pixelscale))
     fwhm = _CORE * model.resolution / pixel
@@ -332,22 +309,15 @@ def on_product(
     angle: float,
     flipx: bool = False,
 ) -> NDArray[np.float64]:
-    """Turn a map the way pyKLIP turns frames; NaN beyond its edges.
+    """Turn a map (ny, nx) of the first frame the way pyKLIP turns frames; NaN beyond its edges.
 
-    Parameters
-    ----------
-    image : ndarray, (ny, nx)
-        Map on the pixels of the first frame.
-    center, product_center : ndarray, (2,)
-        x, y of the star there and in the product.
-    shape : tuple of int
-        Of the product.
-    angle : float
-        Degrees counter-clockwise by which pyKLIP turns the first frame.
-    flipx : bool
-        See `pyklip.klip.rotate`.
+    The star is at x, y = `center` there, and at `product_center` of the product. pyKLIP turns by
+    `angle`, in degrees counter-clockwise; `flipx` is that of `pyklip.klip.rotate`.
     """
     y, x = np.indices(shape)
+    # The pixel of the product at x, y from the star, turned back clockwise:
+    # x' = x cos + y sin, y' = y cos - x sin. A flip of x is undone first, because
+    # `pyklip.klip.rotate` does it last.
     x, y = x - product_center[0], y - product_center[1]
     x = -x if flipx else x
     cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
@@ -363,24 +333,10 @@ def write_throughput(
     *,
     is_turned: bool,
 ) -> float:
-    """Write maps of the throughput, on the pixels of the products, to a FITS file.
+    """Write maps of the throughput on the products' pixels, and return the fitted pixels' median.
 
-    Parameters
-    ----------
-    path : Path
-    dataset : pyklip.instruments.Instrument.Data
-        With the output of the reduction.
-    maps : sequence of ndarray, (ny, nx)
-        For every wavelength, on the pixels of the first frame.
-    frames : sequence of Observation
-        These frames.
-    is_turned : bool
-        Whether pyKLIP has turned north up.
-
-    Returns
-    -------
-    median : float
-        Over the fitted pixels.
+    `maps` (ny, nx), one for every wavelength, are on the pixels of the first frames, which are
+    `frames`. With `is_turned` pyKLIP has turned north up.
     """
     turned = []
     center = np.asarray(dataset.output_centers[0], dtype=float)
@@ -388,6 +344,9 @@ def write_throughput(
         angle = frame.position_angle if is_turned else 0.0
         shape = dataset.output.shape[-2:]
         each = on_product(image, frame.center[0], shape, center, angle, dataset.flipx)
+        # Three kinds of pixels: NaN outside the fitted square, where nothing is taken and the
+        # throughput is 1; inf, so NaN in the file, where the product has no value; and those of the
+        # median.
         each[np.isnan(dataset.output[0, :, k]).all(axis=0)] = np.inf
         turned.append(each)
     cube = np.array(turned)
@@ -414,27 +373,13 @@ def write_throughput(
 
 @dataclass(frozen=True, eq=False)
 class ReductionRecord:
-    """How the frames of one wavelength were reduced.
-
-    Attributes
-    ----------
-    frames : Frames
-        The fitted frames.
-    opd : OPDMap
-        The wavefront map at the start.
-    subtraction : Subtraction
-        The fitted star.
-    filled : int
-        Flagged pixels that were replaced after the subtraction.
-    image : str
-        Image that the products carry, see `DiffrenderSettings`.
-    """
+    """How the frames of one wavelength were reduced."""
 
     frames: Frames
-    opd: OPDMap
+    opd: OPDMap  # at the start of the fit
     subtraction: Subtraction
-    filled: int
-    image: str = "subtracted"
+    filled: int  # flagged pixels that were replaced after the subtraction
+    image: str = "subtracted"  # that the products carry, see `DiffrenderSettings`
 
     def __repr__(self) -> str:
         filter_ = self.frames.observation.filter or "given model"
@@ -454,21 +399,10 @@ class ReductionRecord:
 
 
 def folder_and_prefix(folder: str | os.PathLike[str], prefix: str) -> tuple[Path, str]:
-    """Split where products go into a folder, which is checked before an hour of fitting, and names.
+    """Split `outputdir` and `fileprefix`, which may begin with folders, into folder and names.
 
-    Parameters
-    ----------
-    folder : path
-        The argument `outputdir`.
-    prefix : str
-        The argument `fileprefix`, which may begin with folders.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such folder; pyKLIP does not make it either.
-    PermissionError
-        If nothing can be written there.
+    Raises FileNotFoundError if there is no such folder (pyKLIP does not make it either), and
+    PermissionError if nothing can be written there.
     """
     inside, name = os.path.split(str(prefix))
     path = (Path(folder or ".") / inside).resolve()
@@ -484,10 +418,12 @@ def folder_and_prefix(folder: str | os.PathLike[str], prefix: str) -> tuple[Path
 def staging(folder: Path) -> Iterator[Path]:
     """Path of a temporary folder whose files are moved to `folder` if the block succeeds.
 
-    It is inside `folder`, so that each move is one step on the same file system. If the block
-    raises, the files are deleted and `folder` is unchanged. The block makes the folder when it has
-    something to write: a process that is killed during a long fit then leaves nothing behind.
+    If the block raises, they are deleted and `folder` is unchanged. The block makes the temporary
+    folder.
     """
+    # Inside `folder`, so that each move is one step on the same file system. The block makes it
+    # when it has something to write: a process that is killed in a long fit then leaves nothing
+    # behind.
     stage = folder / f".diffrender-{secrets.token_hex(6)}"
     try:
         yield stage
@@ -503,8 +439,8 @@ def staging(folder: Path) -> Iterator[Path]:
 def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
     """Cards for a product made from these wavelengths: keywords, then HISTORY.
 
-    A keyword holds the value that all fits share; chi2 and status are those of the worst fit.
-    HISTORY has them all.
+    A keyword has the value that all fits share; chi2 and status are the worst fit's. HISTORY has
+    all.
     """
     fits_of_all = [fit for record in records for fit in record.subtraction.fits]
     worst = max(fits_of_all, key=lambda fit: fit.chi2)

@@ -18,22 +18,9 @@ logger = logging.getLogger(__name__)
 class PatchedFunction:
     """A function that keeps its identity but runs other code between `apply` and `restore`.
 
-    Code that imported the function earlier holds this same object, so the patch reaches it too.
-
-    Parameters
-    ----------
-    function : function
-        The function to patch.
-    trampoline : function
-        Its code replaces that of `function`. It runs with the *globals of the patched function*,
-        so it must import what it uses.
-    uses : sequence of str
-        Names that the function must look up in its module, which `original` can replace.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the function is not as expected, for example after a change in pyKLIP.
+    The code is that of `trampoline`, which runs with the globals of the patched function, so has to
+    import what it uses. Raises IncompatibleSetupError if `function` does not look up `uses` in its
+    module.
     """
 
     def __init__(
@@ -55,6 +42,8 @@ class PatchedFunction:
         assert isinstance(trampoline, FunctionType)
         self.function = function
         self.signature = inspect.signature(function)
+        # Only the code is replaced, because others that imported the function hold this same
+        # object.
         self._saved = function.__code__, function.__defaults__, function.__kwdefaults__
         self._trampoline = trampoline.__code__
 

@@ -67,32 +67,21 @@ class Patched(Protocol):
 
 
 class Registry:
-    """The users of the backend, and the settings given to `register`.
-
-    Attributes
-    ----------
-    lock : RLock
-        For changes of the others.
-    patches : Patched or None
-        None while nobody uses the backend.
-    registered : bool
-    blocks, forcing : int
-        Number of `backend` blocks in all threads, and of those that take over KLIP.
-    watching : bool
-        Whether plain KLIP is mentioned, in a spawned process.
-    defaults : DiffrenderSettings
-    replace : bool or None
-        Whether `register` was told to take over KLIP.
-    """
+    """The users of the backend, and the settings given to `register`."""
 
     def __init__(self) -> None:
+        # For changes of the others.
         self.lock = threading.RLock()
+        # None while nobody uses the backend.
         self.patches: Patched | None = None
         self.registered = False
+        # Number of `backend` blocks in all threads, and of those that take over KLIP.
         self.blocks = 0
         self.forcing = 0
+        # Whether plain KLIP is mentioned, in a spawned process.
         self.watching = False
         self.defaults = DiffrenderSettings()
+        # Whether `register` was told to take over KLIP; None if it was told nothing.
         self.replace: bool | None = None
 
 
@@ -251,14 +240,7 @@ def _run_klip(
 ) -> None:
     """Write KLIP's products beside those of this backend, whose results stay in the dataset.
 
-    Parameters
-    ----------
-    klip_dataset : callable
-        pyKLIP's function.
-    arguments : mapping
-        Of the call.
-    before : mapping
-        Attributes of the dataset before the call, from which KLIP starts.
+    KLIP starts from the attributes that the dataset had `before` the call.
     """
     attributes = vars(arguments["dataset"])
     after = dict(attributes)
@@ -312,13 +294,8 @@ def _fm_klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
 def _use(registered: bool, blocks: int, forcing: int | None = None) -> None:
     """Set the users; patch pyKLIP for the first and restore it after the last.
 
-    Parameters
-    ----------
-    registered : bool
-    blocks : int
-        Number of `backend` blocks in all threads.
-    forcing : int, optional
-        Number of those that take over KLIP.
+    `blocks` is the number of `backend` blocks in all threads, `forcing` of those that take over
+    KLIP.
     """
     in_use = registered or blocks > 0 or REGISTRY.watching
     if in_use and REGISTRY.patches is None:
@@ -467,30 +444,10 @@ def reduce_jwst_files(
     verbose: bool = False,
     **settings: Any,
 ) -> Any:
-    """Subtract the star from all rolls together and write pyKLIP's products.
+    """Subtract the star from all rolls together, write pyKLIP's products, return the `JWSTData`.
 
-    Parameters
-    ----------
-    science, references : iterable of path
-        Files of the target and of reference stars, with the star at STARCENX, STARCENY.
-    folder : path
-        Of the products.
-    prefix : str
-        First part of their names.
-    verbose : bool
-        Print what is being done.
-    **settings
-        Fields of `DiffrenderSettings`.
-
-    Returns
-    -------
-    JWSTData
-        The reduced dataset, with its fits in ``diffrender_results``.
-
-    Raises
-    ------
-    DiffrenderError
-        See `klip_dataset` in the guide to pyKLIP scripts.
+    The files have the star at STARCENX, STARCENY. The names of the products, in `folder`, begin
+    with `prefix`; `settings` are fields of `DiffrenderSettings`. Raises as `klip_dataset`.
     """
     from pyklip.instruments.JWST import JWSTData
     from pyklip.parallelized import klip_dataset

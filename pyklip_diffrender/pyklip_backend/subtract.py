@@ -51,24 +51,13 @@ Image = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class FittedPointing:
-    """The part of a fit that belongs to one pointing.
-
-    Attributes
-    ----------
-    result : Refinement
-    index : int
-        Place of the pointing among the frames of the fit.
-    pointing : Pointing
-    window : Window
-        The fitted square.
-    away : ndarray, (2,)
-        x, y in pixels by which the fitted frames were moved onto the pixels of the detector.
-    """
+    """The part of a fit that belongs to one pointing."""
 
     result: Refinement
-    index: int
+    index: int  # place of the pointing among the frames of the fit
     pointing: Pointing
-    window: Window
+    window: Window  # the fitted square
+    # (2,), x, y in pixels by which the fitted frames were moved onto the pixels of the detector.
     away: Image
 
     def __repr__(self) -> str:
@@ -81,23 +70,19 @@ class FittedPointing:
 
     @cached_property
     def box(self) -> Window:
-        """Pixels that can be rendered: all valid ones of the frames, or the fitted square only.
-
-        The fitted wavefront is rendered on a larger detector if the model's field of view can be
-        changed.
-        """
+        """Pixels that can be rendered: all valid ones of the frames, or the fitted square only."""
+        # The fitted wavefront can be rendered on a larger detector if the model's field can be
+        # changed.
         box = Window.holding(self.pointing.observation.valid)
         adjustable = "fov_pixels" in self.result.model.adjustable
         return box if box not in self.window and adjustable else self.window
 
     def star(self) -> Image:
-        """The star over all pixels that can be rendered, (ny, nx), NaN elsewhere.
-
-        A fit ends where further steps gain less than the noise. How much of a faint planet it has
-        taken for star by then depends on where it stopped. So the last step of the linear model is
-        added, which is a small part of the noise, and after which every fit has taken as much as
-        the exact solution.
-        """
+        """The star over all pixels that can be rendered, (Ny, Nx) of the frame, NaN elsewhere."""
+        # A fit ends where further steps gain less than the noise. How much of a faint planet it has
+        # taken for star by then depends on where it stopped. So the last step of the linear model
+        # is added, which is a small part of the noise, and after which every fit has taken as much
+        # as the exact solution.
         return self._fitted_star() + self._last_step()
 
     def _fitted_star(self) -> Image:
@@ -123,12 +108,9 @@ class FittedPointing:
         return self.paste(np.asarray(self.frame.star), window)
 
     def change_of_star(self, change: Tensor) -> Image:
-        """Change of the star, (ny, nx) of the fitted square, for changes of the unknowns.
+        """Change of the star, (ny, nx) of the fitted square, for `change` (unknowns,).
 
-        Parameters
-        ----------
-        change : Tensor, (unknowns,)
-            Changes of the unknowns; those of companions do not count.
+        Changes of companions do not count.
         """
         linear = self.result.linear
         star = torch.tensor([unknown.name != "companions" for unknown in linear.unknowns])
@@ -156,17 +138,9 @@ class FittedPointing:
         return self.change_in_frames(self.result.linear.step)
 
     def source(self, offset: Image, box: Window) -> Image:
-        """A source with the light of the star, on the pixels of a box as they were fitted.
+        """A source as bright as the star on the pixels of `box` as they were fitted, (ny, nx).
 
-        Parameters
-        ----------
-        offset : ndarray, (2,)
-            x, y in pixels from the star's place in the header.
-        box : Window
-
-        Returns
-        -------
-        ndarray, (ny, nx)
+        `offset` is x, y in pixels from the star's place in the header.
         """
         return self._rendered(box, self.position(offset))
 
@@ -201,6 +175,8 @@ class FittedPointing:
     def mean_light(self, light: Image) -> Image:
         """Average light in all frames, (n, Ny, Nx), as the fit averages the frames: (ny, nx)."""
         group = self.pointing.observation
+        # sum_k w_k light_k / sum_k w_k with w = 1 / error^2, which is 0 for pixels that are not
+        # valid.
         weight = np.where(group.valid, group.error, np.inf) ** -2.0
         total = np.sum(weight * np.nan_to_num(light[self.pointing.frames]), axis=0)
         return self.cut(total / np.maximum(weight.sum(axis=0), np.finfo(float).tiny))
@@ -227,55 +203,32 @@ FIT_PIXELS = 80
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """One fit of the star, to some of the frames.
+    """One fit of the star, to some of the frames."""
 
-    Attributes
-    ----------
-    frames : tuple of int
-        Indices of the frames.
-    status : str
-        How the fit ended.
-    chi2 : float
-        chi2 per fitted pixel.
-    result : Any
-        The full result, for `detect`; a `Refinement` by default.
-    """
-
-    frames: tuple[int, ...]
-    status: str
-    chi2: float
-    result: Any = None
+    frames: tuple[int, ...]  # their indices
+    status: str  # how the fit ended
+    chi2: float  # per fitted pixel
+    result: Any = None  # for `detect`; a `Refinement` by default
 
 
 @dataclass(frozen=True, eq=False)
 class Subtraction:
-    """The star in the frames of one wavelength.
+    """The star in the frames of one wavelength."""
 
-    Attributes
-    ----------
-    star : ndarray
-        (n, ny, nx) star and uniform background to subtract, in the unit and on the pixels of the
-        observation; NaN outside the model's field.
-    fits : tuple of Fit
-        At least one; together they cover all frames.
-    systematics : str
-        Name of the flat-field pattern that was used.
-    references : int
-        Number of frames of reference stars that were used.
-    pointings : tuple of FittedPointing
-        The parts of the fits, one for each pointing; empty for other subtractors.
-    reduction : Reduction, optional
-        Fit, search and extended light, as `reduce` has them; None for other subtractors.
-    kept : int
-        Number of candidates whose light was kept out of the star.
-    """
-
+    # (n, ny, nx), star and uniform background to subtract, in the unit and on the pixels of the
+    # observation; NaN outside the model's field.
     star: NDArray[np.float64]
+    # At least one; together they cover all frames.
     fits: tuple[Fit, ...]
+    # Name of the pattern that was used.
     systematics: str = "none"
+    # Number of frames of reference stars that were used.
     references: int = 0
+    # The parts of the fits, one for each pointing; empty for other subtractors.
     pointings: tuple[FittedPointing, ...] = ()
+    # Fit, search and extended light, as `reduce` has them; None for other subtractors.
     reduction: Reduction | None = None
+    # Number of candidates whose light was kept out of the star.
     kept: int = 0
 
     def __repr__(self) -> str:
@@ -297,21 +250,11 @@ class Subtractor(Protocol):
     def __call__(
         self, observation: Observation, opd: OPDMap, settings: DiffrenderSettings
     ) -> Subtraction:
-        """Fit the star in all frames of an observation.
+        """Fit the star in n frames of one wavelength, each with at least one valid pixel.
 
-        Parameters
-        ----------
-        observation : Observation
-            n frames of one wavelength, each with at least one valid pixel.
-        opd : OPDMap
-            The wavefront map to start from.
-        settings : DiffrenderSettings
-            `settings.model` is the model for this wavelength.
-
-        Raises
-        ------
-        DiffrenderError
-            If there is no usable result; the reduction then stops and leaves no products.
+        The fit starts from `opd`; `settings.model` is the model for this wavelength. A
+        DiffrenderError, if there is no usable result, stops the reduction, which then leaves no
+        products.
         """
         ...
 
@@ -327,40 +270,18 @@ def subtract_by_refinement(
 ) -> Subtraction:
     """Reduce the frames as `pyklip_diffrender.reduce` does, and render the star (the default).
 
-    All frames are fitted together: those with the same star centre and position angle, such as
-    the integrations of one exposure, are averaged first, and all rolls and dithers share a
-    wavefront. The fit uses a square about the star, the subtraction covers all valid pixels.
-
-    Parameters
-    ----------
-    observation, opd, settings
-        See `Subtractor`.
-    pointings : sequence of Pointing, optional
-        The frames by pointing, in order of time, with what their files say; by default the
-        frames of `observation` are sorted by where they show the star.
-    references : sequence of Observation
-        Frames of reference stars.
-    tell : callable
-        Called with a line of text at every stage.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If there is neither a model nor a filter to make one for, or if "references" is asked for
-        without any.
-    RefinementError
-        If a refinement has no usable or no plausible result.
-
-    Warns
-    -----
-    DiffrenderWarning
-        If a fit has not converged to a model that explains the data.
+    `pointings` are the frames in order of time with what their files say, by default from
+    `observation`; `tell` gets a line of text at every stage. Raises RefinementError for an
+    implausible fit, and warns of one that has not converged.
     """
     model = model_of(observation, settings)
     # Takes a second to import, so only after the input has been checked.
     from pyklip_diffrender.reduction import prepare
     from pyklip_diffrender.reduction.pipeline import warn_of_status
 
+    # Frames with the same star centre and position angle, such as the integrations of one exposure,
+    # are averaged; all rolls and dithers share a wavefront. The fit uses a square about the star,
+    # the subtraction covers all valid pixels.
     groups = list(pointings_of(observation) if pointings is None else pointings)
     # Averaged before they are cut, as the means of files are, so that the weights are the same.
     science = tuple(group.observation.combined() for group in groups)
@@ -409,10 +330,7 @@ def subtract_by_refinement(
 def _give_back(
     star: NDArray[np.float64], fitted: Sequence[FittedPointing], detection: Detection
 ) -> None:
-    """Take the light of candidates out of the star (n, Ny, Nx) in place, to first order.
-
-    Those that are companions of the fit have lost nothing to the star.
-    """
+    """Take the light of candidates out of the star (n, Ny, Nx) in place, to first order."""
     # Takes a second to import.
     from pyklip_diffrender.detection.candidates import are_companions
 
@@ -421,6 +339,7 @@ def _give_back(
         candidates = candidates.without(int(k))
     if not len(candidates):
         return
+    # The star has taken J H^-1 G (their light); those that are companions of the fit, none.
     linear, templates = detection.groups[0]
     change = linear.response(candidates.light(templates))[:, 0]
     for part in fitted:
@@ -451,12 +370,9 @@ def _options(
 def _requested_pattern(
     settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
 ) -> PatternRequest:
-    """Return the pattern that is asked for: real NIRCam frames get "auto", others "off".
+    """The pattern that is asked for; "auto" for real NIRCam frames and "off" for others by default.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        If "references" is asked for without any.
+    Raises IncompatibleSetupError if "references" is asked for without any.
     """
     from pyklip_diffrender.pattern import as_request
 
@@ -482,13 +398,7 @@ def _counted(number: int, noun: str) -> str:
 
 
 def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:
-    """The model from the settings, else one made for the observation's filter.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If there is neither a model nor a filter.
-    """
+    """The model from the settings, else one made for the observation's filter."""
     if settings.model is not None:
         return cast("OpticalSystem", settings.model)
     if observation.filter is None:

@@ -44,21 +44,10 @@ def klip_rdi(
     *,
     numbasis: int = 9,
 ) -> NDArray[np.float64]:
-    """Subtract the star with pyKLIP's reference differential imaging.
+    """Subtract the star from `target` (ny, nx) with pyKLIP's reference differential imaging.
 
-    Parameters
-    ----------
-    target : ndarray, (ny, nx)
-        The frame, with the star in the middle of the array.
-    references : ndarray, (frames, ny, nx)
-        Frames of a reference star.
-    numbasis : int
-        Karhunen-Loeve modes.
-
-    Returns
-    -------
-    ndarray, (ny, nx)
-        The subtracted frame; NaN in the innermost pixel and outside the largest annulus.
+    The star is in the middle of the array; `references` are (frames, ny, nx). The result, (ny, nx),
+    is NaN in the innermost pixel and outside the largest annulus.
     """
     from pyklip import rdi
     from pyklip.instruments.Instrument import GenericData
@@ -139,41 +128,18 @@ _CLOSE = 1.5
 def klip_curve(
     detection: Detection, references: Sequence[Observation] = (), separations: Any = None
 ) -> QTable:
-    """Compute the 5-sigma contrast curve of KLIP for the frames that were searched.
+    """5-sigma contrast curve of KLIP for the frames that were searched.
 
-    Every roll is projected onto the Karhunen-Loeve modes of the other rolls and all frames of
-    reference stars. The residuals are turned to the orientation of the first roll, averaged and
-    smoothed with the image of a planet. The noise is the standard deviation in a ring of width
-    lambda/D where the detection has limits, the throughput that of injected planets, and the number
-    of modes at every separation that with the best limit. The light of all candidates is subtracted
-    first, whether the fit has them as companions or only the search found them: they are noise of
-    neither method.
-
-    Parameters
-    ----------
-    detection : Detection
-        Its frames are aligned by the fitted positions of the star.
-    references : sequence of Observation
-        Frames of reference stars, cut to the same pixels; aligned by the recorded positions.
-    separations : array or Quantity, optional
-        arcsec; by default twelve from 2 lambda/D to the edge of the frames. Those beyond the edge
-        are left out.
-
-    Returns
-    -------
-    QTable
-        Columns separation; contrast, NaN where no light of a planet is left or the detection has no
-        limits; contrast with the small-sample correction; number of modes; throughput, the fraction
-        of a planet's image behind the mask that is left. The first columns have the names of those
-        of `Detection.contrast_curve`; ``meta["label"]`` says how the star was subtracted.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If a roll has no references, or no separation is in the frames.
+    Columns are as of `Detection.contrast_curve`; a contrast is NaN where no light of a planet is
+    left or the detection has no limits, and throughput the fraction of a planet's image behind the
+    mask. `references` are cut to the same pixels; `separations` are in arcsec, by default twelve
+    from 2 lambda/D to the edge. Raises IncompatibleSetupError if a roll has no references, or no
+    separation is in the frames.
     """
     templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
+    # The light of all candidates is subtracted first, whether the fit has them as companions or
+    # only the search found them: they are noise of neither method.
     klip = KlipSubtraction(templates, references, resolution, candidates=detection.sources)
     # The corners' smaller coordinates.
     edge = np.abs(klip.grid[[0, -1], [0, -1]]).min() - resolution / 2
@@ -192,10 +158,15 @@ def klip_curve(
     noise = np.array(
         [[image[ring].std() if ring.any() else 0.0 for ring in rings] for image in plain]
     )
+    # limit = 5 noise / response, with the noise in a ring of width lambda/D, where the detection
+    # has limits, and the response to an injected planet of contrast 1. At every separation the
+    # number of modes is that with the best limit.
     # So faint that the modes hardly change.
     contrasts = _SIGMAS * noise.min(axis=0) / klip.norm
     response, alone = np.zeros_like(noise), np.zeros(len(separations))
     for s, separation in enumerate(separations):
+        # Evenly spread at every separation, and from one separation to the next by the golden
+        # angle, so that no direction is preferred.
         angles = np.radians(_GOLDEN * s + 360 / _TRIALS * np.arange(_TRIALS))
         wanted = separation * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         rows, columns = np.array([klip.pixel(each) for each in wanted]).T
@@ -249,32 +220,10 @@ def klip_image(
 ) -> tuple[Image, Image, str]:
     """Subtract the star from the frames that were searched with KLIP, and combine them.
 
-    Parameters
-    ----------
-    detection : Detection
-    references : sequence of Observation
-        As for `klip_curve`.
-    science : sequence of Observation, optional
-        In place of the frames of the fit, from which a disk may have been subtracted.
-    modes : int
-        Largest number of modes.
-    north : float
-        Degrees by which the image is turned counter-clockwise from the orientation of the first
-        frame: its position angle turns it north up.
-
-    Returns
-    -------
-    image : ndarray, (ny, nx)
-        In the data's unit; NaN close to the star, where nothing is subtracted.
-    grid : ndarray, (ny, nx, 2)
-        x, y of its pixels from the star, arcsec.
-    label : str
-        References and modes.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If a roll has no references.
+    Returns the image (ny, nx) in the data's unit, NaN close to the star, turned counter-clockwise
+    by `north` degrees from the first frame; x, y (ny, nx, 2) of its pixels from the star, arcsec;
+    and a label. `science` takes the place of the fit's frames, from which a disk may have been
+    subtracted.
     """
     templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
@@ -290,23 +239,12 @@ def small_sample_factor(
 ) -> NDArray[np.float64]:
     """Factor of a detection threshold when the noise is estimated from few resolution elements.
 
-    D. Mawet et al., "Fundamental limitations of high contrast imaging set by small sample
-    statistics", ApJ 792, 97 (2014), section 3.2. With n = 2 pi r / resolution elements, the false
-    alarm probability of `sigmas` Gaussian standard deviations belongs to a value of Student's t
-    with n - 2 degrees of freedom, times sqrt(1 + 1 / (n - 1)).
-
-    Parameters
-    ----------
-    separation : ndarray
-        In the unit of `resolution`.
-    resolution : float
-        Size of a resolution element, lambda/D.
-
-    Returns
-    -------
-    ndarray
-        Threshold over `sigmas`; inf for fewer than three elements.
+    `separation` has the unit of `resolution`, lambda/D; inf for fewer than three elements.
     """
+    # D. Mawet et al., "Fundamental limitations of high contrast imaging set by small sample
+    # statistics", ApJ 792, 97 (2014), section 3.2: with n = 2 pi r / resolution elements, the false
+    # alarm probability of `sigmas` Gaussian standard deviations belongs to a value of Student's t
+    # with n - 2 degrees of freedom, times sqrt(1 + 1 / (n - 1)).
     elements = np.floor(2 * math.pi * np.asarray(separation, dtype=float) / resolution)
     freedom = np.maximum(elements - 2, 1)
     threshold = stats.t.isf(stats.norm.sf(sigmas), freedom) * np.sqrt(
@@ -318,37 +256,9 @@ def small_sample_factor(
 class KlipSubtraction:
     """Aligned frames of a fit and of reference stars, and their subtraction with KLIP.
 
-    Parameters
-    ----------
-    templates : Templates
-        Of the fit.
-    references : sequence of Observation
-    resolution : float
-        lambda/D, arcsec.
-    science : sequence of Observation, optional
-        In place of the frames of the fit, from which a disk may have been subtracted.
-    candidates : Candidates, optional
-        Point sources whose light is subtracted from the frames of the target.
-
-    Attributes
-    ----------
-    science, references : (frames, ny, nx), and list of (ny, nx)
-        Aligned frames, the star at `center`.
-    center : (2,)
-        x, y of the star in aligned frames, pixels.
-    shifts : (frames, 2)
-        x, y in pixels by which frames were moved.
-    grid : (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-    distance : (ny, nx)
-        arcsec.
-    modes : (modes,)
-        Numbers of Karhunen-Loeve modes.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If a roll has no references.
+    `resolution` is lambda/D, arcsec; `science` takes the place of the fit's frames, from which a
+    disk may have been subtracted; the light of `candidates` is subtracted. Raises
+    IncompatibleSetupError if a roll has no references.
     """
 
     def __init__(
@@ -370,6 +280,7 @@ class KlipSubtraction:
         others = [
             each.center.mean(axis=0) + (places - recorded).mean(axis=0) for each in references
         ]
+        # (2,), x, y of the star in aligned frames, and (frames, 2), how far they are moved, pixels.
         self.center = np.round(places[0])
         self.shifts = self.center - places
         if science is None:
@@ -378,6 +289,7 @@ class KlipSubtraction:
         if candidates is not None and len(candidates):
             light = candidates.light(templates)
             images -= np.array([light[k][0].numpy() for k in frames])
+        # (frames, ny, nx), and a list of (ny, nx): aligned, the star at `center`.
         self.science = shift_frames(images, self.shifts)
         self.references = [
             shift_frames(_filled(each)[None], (self.center - place)[None])[0]
@@ -387,6 +299,7 @@ class KlipSubtraction:
         scales = templates.origin.observation.pixelscale
         self.pixelscale = float(np.sqrt(scales[0] * scales[1]))
         y, x = np.indices(self.science[0].shape)
+        # (ny, nx, 2) and (ny, nx): x, y of the pixels from the star, and the distance, arcsec.
         self.grid = (np.stack([x, y], axis=-1) - self.center) * scales
         self.distance = np.hypot(self.grid[..., 0], self.grid[..., 1])
         self._zone = self.distance > _INNER * resolution
@@ -400,6 +313,7 @@ class KlipSubtraction:
                 "klip_curve: got a roll without references, expected frames of reference stars or "
                 f"rolls that differ by more than {_TURN:g} degree"
             )
+        # (modes,), numbers of Karhunen-Loeve modes.
         self.modes = np.arange(1, min(_MODES, fewest) + 1)
         # Halfway to the edge the mask does not matter.
         row, column = self.pixel(np.array([self.grid[0, -1, 0] / 2, 0.0]))
@@ -435,12 +349,14 @@ class KlipSubtraction:
         return int(row), int(column)
 
     def residuals(self, science: Image, north: float = 0.0) -> Image:
-        """Frames without the star, turned and averaged, (modes, ny, nx).
+        """Frames minus star, averaged, turned by `north` from the first roll: (modes, ny, nx).
 
-        They have the orientation of the first roll, turned counter-clockwise by `north` degrees.
+        `north` is in degrees counter-clockwise.
         """
         total = np.zeros((len(self.modes), *self.distance.shape))
         for frame, roll, others in zip(science, self.rolls, self._library, strict=True):
+            # Every roll is projected onto the Karhunen-Loeve modes of the other rolls and all
+            # frames of reference stars; the covariance of these gives the modes.
             frames = [*(science[j] for j in others), *self.references]
             library = np.array([each[self._zone] for each in frames])
             # numpy gives the covariance of a single reference as a number.
@@ -463,6 +379,7 @@ def _filled(observation: Observation) -> Image:
     """The mean of the frames, masked pixels interpolated between their neighbours."""
     mean = observation.combined()
     valid = mean.valid[0].astype(float)
+    # Mean of the valid neighbours with Gaussian weights: sum w v d / sum w v.
     weight = gaussian_filter(valid, 1.0)
     nearby = gaussian_filter(mean.data[0], 1.0)
     filled = np.divide(nearby, weight, out=np.zeros_like(nearby), where=weight > 1e-3)

@@ -78,16 +78,7 @@ _REFERENCES = (
 
 
 def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
-    """Advice about the status of a fit.
-
-    Parameters
-    ----------
-    status : Status
-    patterned : bool
-        Whether the flat-field pattern was known.
-    remark : str
-        Further advice about the reduction.
-    """
+    """Advice about the status of a fit, with or without a known flat-field pattern."""
     missing = _REFERENCES if status is Status.MODEL_MISMATCH and not patterned else ""
     return f"{_ADVICE[status]}{missing} {remark}".rstrip()
 
@@ -214,16 +205,8 @@ def _places(error: float) -> int:
 def depth_against_klip(curve: Mapping[str, Any], klip: Mapping[str, Any] | None) -> str:
     """Say in a sentence whose limits are deeper at which separations, and by how much.
 
-    Parameters
-    ----------
-    curve, klip : dict
-        Contrast curves of a summary, with lists separation_arcsec, contrast and small_sample.
-        Those of KLIP are compared at its separations, as far as both have limits.
-
-    Returns
-    -------
-    str
-        Empty without KLIP, or if the curves have no separation in common.
+    The curves are those of a summary (separation_arcsec, contrast, small_sample), and are compared
+    at KLIP's separations. Empty without KLIP, or if the curves have no separation in common.
     """
     if klip is None:
         return ""
@@ -246,6 +229,7 @@ def _deeper(curve: Mapping[str, Any], klip: Mapping[str, Any], name: str) -> str
     )  # fmt: skip
     if not len(places):
         return ""
+    # Limits fall by orders of magnitude with the separation: their logarithms are interpolated.
     ratios = theirs / np.exp(np.interp(at, places, np.log(ours), np.nan, np.nan))
     known = [(s, r) for s, r in zip(at, ratios, strict=True) if math.isfinite(r)]
     parts = []
@@ -275,21 +259,11 @@ FIGURE_FORMATS = ("pdf", "png", "svg")
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A figure of a page and its words.
+    """A figure of a page and its words."""
 
-    Attributes
-    ----------
-    name : str
-        Of its file, without the ending.
-    figure : matplotlib Figure
-    alt : str
-        Description of the picture, for readers who do not see it.
-    caption : str
-    """
-
-    name: str
-    figure: Any
-    alt: str
+    name: str  # of its file, without the ending
+    figure: Any  # of matplotlib
+    alt: str  # description of the picture, for readers who do not see it
     caption: str
 
     @cached_property

@@ -44,17 +44,7 @@ Image = NDArray[np.float64]
 
 
 class SkyImages:
-    """Images with north up, or with the orientation of the first frame where north is not known.
-
-    Parameters
-    ----------
-    reduction : Reduction
-
-    Attributes
-    ----------
-    grid : ndarray, (n, n, 2)
-        x, y of the pixels from the star, arcsec; y is north and x is west.
-    """
+    """Images with north up, or with the orientation of the first frame where north is not known."""
 
     def __init__(self, reduction: Reduction) -> None:
         self.detection: Detection = reduction.detection
@@ -64,6 +54,7 @@ class SkyImages:
         self.oriented = observation.position_angles is not None
         self._half = max(observation.shape) // 2
         y, x = np.mgrid[-self._half : self._half + 1, -self._half : self._half + 1]
+        # (n, n, 2), x, y of the pixels from the star, arcsec; y is north and x is west.
         self.grid = np.sqrt(np.prod(observation.pixelscale)) * np.stack([x, y], axis=-1)
         self.to_sky = rotation_matrix(self.detection.north)
 
@@ -99,10 +90,11 @@ class SkyImages:
     def throughput(self) -> Image:
         """Fraction of the light of a faint source that `combined` has, by a matched filter.
 
-        The fit of the star takes the rest. By linear theory it is the ratio of what the frames say
-        of the source's flux with the star marginalised, and with the star known; the light of a
-        candidate, which is fitted with the star, is in the image as a whole.
+        The light of a candidate, which is fitted with the star, is in the image as a whole.
         """
+        # The fit of the star takes the rest. By linear theory the fraction that is left is what the
+        # frames say of the source's flux with the star marginalised, 1 / error^2, over what they
+        # say of it with the star known, 1 / photon_error^2.
         detection = self.detection
         error = detection.error / detection.error_factor.of(detection.grid)
         return self.turned((detection.photon_error / error) ** 2)
@@ -154,24 +146,12 @@ _LINEAR = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Klip:
-    """KLIP on the frames of a reduction.
+    """KLIP on the frames of a reduction."""
 
-    Attributes
-    ----------
-    curve : QTable
-        See `klip_curve`.
-    image : ndarray, (ny, nx)
-        Frames without the star, combined, north up.
-    grid : ndarray, (ny, nx, 2)
-        x, y of its pixels from the star, arcsec.
-    label : str
-        References and modes of the image.
-    """
-
-    curve: QTable
-    image: Image
-    grid: Image
-    label: str
+    curve: QTable  # see `klip_curve`
+    image: Image  # (ny, nx), frames without the star, combined, north up
+    grid: Image  # (ny, nx, 2), x, y of its pixels from the star, arcsec
+    label: str  # references and modes of the image
 
     @classmethod
     def of(cls, reduction: Reduction) -> Klip | None:
@@ -197,13 +177,7 @@ class Klip:
 
 
 class Overview:
-    """Images with north up, or with the orientation of the first frame where north is not known.
-
-    Parameters
-    ----------
-    images : SkyImages
-    klip : Klip, optional
-    """
+    """Images with north up, or with the orientation of the first frame where north is not known."""
 
     def __init__(self, images: SkyImages, klip: Klip | None) -> None:
         self.images, self.klip = images, klip
@@ -226,13 +200,7 @@ class Overview:
         )
 
     def draw(self, ax: Any, panel: str) -> None:
-        """Draw one of `panels`; all images of light have the same scale.
-
-        Parameters
-        ----------
-        ax : Axes
-        panel : str
-        """
+        """Draw one of `panels`; all images of light have the same scale."""
         grid, north = self.images.grid, 0.0 if self.images.oriented else None
         if panel == "snr":
             snr = self.images.turned(self._detection.snr)
@@ -295,17 +263,11 @@ _STAMP = 0.45
 
 @dataclass(frozen=True)
 class ReportPictures:
-    """The pictures of a report, by section; those that a reduction does not have are missing.
-
-    Attributes
-    ----------
-    overview, curve, wide, disk, injections, completeness, wavefront : sequence of Picture
-    candidates, stars : sequence of sequence of Picture
-        For each candidate and for each frame of the target that is shown.
-    """
+    """The pictures of a report, by section; those that a reduction does not have are missing."""
 
     overview: Pictures = ()
     curve: Pictures = ()
+    # For each candidate and, below, for each frame of the target that is shown.
     candidates: Sequence[Pictures] = ()
     wide: Pictures = ()
     disk: Pictures = ()
@@ -487,6 +449,7 @@ def _roll(north: float | None) -> str:
 
 def _source_of(detection: Detection, place: int) -> int:
     """Place among the sources, which are in the order they were found, of a row of the table."""
+    # The table is in the order of the S/N.
     return int(np.argsort(-detection.sources.snr(detection.error_factor))[place])
 
 
@@ -509,6 +472,7 @@ def _stamps(detection: Detection, place: int) -> list[drawing.Stamp]:
             axis + scale * np.arange(-half, half + 1)
             for axis, scale in zip(frame.grid[row, column], observation.pixelscale, strict=True)
         )
+        # Of all candidates, only the light of this one stays in the picture without the star.
         data, left, model, noise = (
             np.pad(np.where(valid, image, np.nan), half, constant_values=np.nan)[window]
             for image in (
@@ -523,7 +487,7 @@ def _stamps(detection: Detection, place: int) -> list[drawing.Stamp]:
 def _measured(
     detection: Detection, place: int
 ) -> tuple[tuple[str, str], NDArray[np.float64], NDArray[np.float64]]:
-    """Contrast and offset of a candidate, arcsec, with their covariance.
+    """Contrast and offset (3,) of a candidate, arcsec, with their names and covariance (3, 3).
 
     The offset is that to the east and north where the orientation is known, else x and y.
     """
@@ -539,6 +503,7 @@ def _measured(
         return ("x", "y"), np.array([row["contrast"], x, y]), covariance
     angle = np.deg2rad(detection.north)
     sine, cosine = np.sin(angle), np.cos(angle)
+    # East is -x cos n + y sin n, north x sin n + y cos n; see docs/conventions.md.
     turn = np.eye(3)
     turn[1:, 1:] = [[-cosine, sine], [sine, cosine]]
     return ("ΔRA cos Dec", "ΔDec"), turn @ [row["contrast"], x, y], turn @ covariance @ turn.T

@@ -273,12 +273,7 @@ _ADVICE = {
 
 
 def require_plausible(name: str, result: Refinement, limit: float) -> None:
-    """Refuse a fit that failed, or that has nothing to do with the frames.
-
-    Raises
-    ------
-    RefinementError
-    """
+    """Raise RefinementError for a fit that failed, or has nothing to do with the frames."""
     from pyklip_diffrender.refinement.fit_result import WHAT_TO_CHECK
 
     if not result.status.usable:
@@ -301,12 +296,7 @@ def reduced_chi2(result: Refinement) -> float:
 
 
 def warn_of_status(name: str, result: Refinement) -> None:
-    """Say what to do about a fit that is usable but has not converged.
-
-    Warns
-    -----
-    DiffrenderWarning
-    """
+    """Warn of a fit that is usable but has not converged, and say what to do about it."""
     advice = _ADVICE.get(result.status.name)
     if advice is not None:
         warnings.warn(
@@ -423,24 +413,9 @@ def prepare(
 ) -> Preparation:
     """Check that a sequence can be reduced, and make what the reduction starts from.
 
-    Parameters
-    ----------
-    sequence : Sequence
-    opd : path, OPDMap, Quantity, array or "flat"
-    options : ReduceOptions
-    model : OpticalSystem, optional
-        By default that of the frames' filter and mask, with `size` pixels a side, which must be
-        inside the frames. With a model, as many pixels as its detector has are fitted; those beyond
-        the edges of the frames are masked.
-
-    Returns
-    -------
-    Preparation
-
-    Raises
-    ------
-    DiffrenderError
-        See `reduce`.
+    The model is by default that of the frames' filter and mask, with `size` pixels a side, which
+    must be inside the frames. With a model, as many pixels as its detector has are fitted; those
+    beyond the edges of the frames are masked. Raises as `reduce`.
     """
     wavefront = wavefront_for(opd, sequence.date)
     if options.star_flux is not None:
@@ -467,37 +442,23 @@ def prepare(
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """A reduction that was checked and can begin.
+    """A reduction that was checked and can begin."""
 
-    Attributes
-    ----------
-    whole, sequence : Sequence
-        The frames, and the same cut to the fitted pixels.
-    model : OpticalSystem
-    wavefront : OPDMap
-        The wavefront to start from.
-    options : ReduceOptions
-    settings : GaussNewton or None
-        Settings of the fits; None for those of `refine`.
-    """
-
+    # The frames, and the same cut to the fitted pixels.
     whole: Sequence
     sequence: Sequence
     model: OpticalSystem
+    # To start from.
     wavefront: OPDMap
     options: ReduceOptions
+    # Of the fits; None for those of `refine`.
     settings: GaussNewton | None = None
 
     def run(self, *, progress: bool = False, products: ProductFolder | None = None) -> Reduction:
         """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
 
-        Parameters
-        ----------
-        progress : bool
-            Show progress bars.
-        products : ProductFolder, optional
-            Where to write the products as they come. It may have what an interrupted reduction has
-            done.
+        `products` gets the products as they come, and may have what an interrupted reduction has
+        done.
         """
         with numbered_stages():
             return _Run(self, progress, products).result()
@@ -626,6 +587,8 @@ class _Run:
     def _choice(self, saved: Checkpoint) -> PatternChoice:
         """The choice of the pattern of an interrupted reduction, without fits of other stars."""
         options = self.preparation.options
+        # The pattern of reference stars or of the caller was stored. That of the library is looked
+        # up again, which moves the frames onto its pixels if need be.
         known = as_request(options.systematics)
         if saved.origin != "library":
             known = saved.systematics or "off"
@@ -675,10 +638,9 @@ class _Run:
         return self.preparation.sequence.references if joins else ()
 
     def _joins_early(self, choice: PatternChoice) -> bool:
-        """Whether the fit of the target alone is only the beginning of that of all frames.
-
-        Where the library knows the pattern, it may be the better one.
-        """
+        """Whether the fit of the target alone is only the beginning of that of all frames."""
+        # Where the library knows the pattern, the target alone may have the deeper limits, so it is
+        # fitted to the end and both fits are searched.
         return bool(self._joining) and choice.origin != "library"
 
     def _with_references(self, fit: Refinement, choice: PatternChoice) -> Joined:
@@ -727,6 +689,8 @@ class _Run:
             if disk is None:
                 joined = self._with_references(self._fit(science, choice), choice)
                 return joined.detection or self._search(joined.fit)
+            # The fitted frames are without the light of the disk: it is put back, and fitted again
+            # with the planets there.
             whole = [
                 replace(frame, data=frame.data + light)
                 for frame, light in zip(science, disk.light, strict=True)

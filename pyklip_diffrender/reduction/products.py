@@ -67,16 +67,7 @@ _PHOTOMETRY = (
 def page(
     summary: Mapping[str, Any], shown: ReportPictures, files: Mapping[str, str] | None = None
 ) -> str:
-    """The report as a page of HTML.
-
-    Parameters
-    ----------
-    summary : dict
-        See `summarise`.
-    shown : ReportPictures
-    files : mapping of str to str, optional
-        Names of the files that were written with it, and their content.
-    """
+    """The report as a page of HTML; `files` are names and contents of the files written with it."""
     status, first = summary["status"], summary["candidates"][:1]
     message = status["message"]
     wide = summary["wide_field"]
@@ -287,28 +278,11 @@ def write_products(
     derivatives: bool = False,
     figures: Literal["pdf", "png", "svg"] | None = None,
 ) -> list[Path]:
-    """Write the products of a reduction; see `Reduction.write`.
+    """Write the products of a reduction, and return their paths; see `Reduction.write`.
 
-    Parameters
-    ----------
-    reduction : Reduction
-    folder : Path
-        Made if it does not exist. Afterwards it has no products of an earlier reduction.
-    fit : bool
-        Write ``fit.fits``.
-    derivatives : bool
-        Write the derivatives of the fit with it.
-    figures : {"pdf", "png", "svg"}, optional
-        Write every figure of the report to a file of this format, too.
-
-    Returns
-    -------
-    list of Path
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For another format.
+    The folder is made if it does not exist. Afterwards it has no products of an earlier reduction.
+    `derivatives` says whether ``fit.fits`` has those of the images. Raises IncompatibleSetupError
+    for a format that is not one of `FIGURE_FORMATS`.
     """
     if figures is not None and figures not in FIGURE_FORMATS:
         raise IncompatibleSetupError(
@@ -345,39 +319,23 @@ def write_products(
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What a reduction that is resumed has done before.
+    """What a reduction that is resumed has done before."""
 
-    Attributes
-    ----------
-    done : frozenset of str
-        Names of the stages: search, disk, wide, injections, completeness.
-    fit : Refinement
-        Frames of reference stars that were fitted with the target's come after them.
-    detection : Detection
-    visit : Visit
-        What the frames of reference stars have contributed.
-    settings : GaussNewton or None
-        Settings of the fits of the target alone.
-    systematics : Systematics or None
-        The flat-field pattern of the target's own fit.
-    origin : str
-        Where the pattern comes from, see `PatternChoice`.
-    pattern : str
-        The same with the names of its stars.
-    failed : tuple of (str, str)
-        Reference stars that could not be fitted.
-    disk : Disk or None
-    injections, completeness : QTable or None
-    """
-
+    # Names of the stages: search, disk, wide, injections, completeness.
     done: frozenset[str]
+    # Frames of reference stars that were fitted with the target's come after them.
     fit: Refinement
     detection: Detection
+    # What the frames of reference stars have contributed.
     visit: Visit
+    # Of the fits of the target alone.
     settings: GaussNewton | None
+    # The pattern of the target's own fit.
     systematics: Systematics | None
+    # Where the pattern comes from, see `PatternChoice`, and the same with the names of its stars.
     origin: Any
     pattern: str
+    # Reference stars that could not be fitted, and why.
     failed: tuple[tuple[str, str], ...]
     disk: Disk | None
     injections: QTable | None
@@ -387,26 +345,9 @@ class Checkpoint:
 class ProductFolder:
     """A folder into which a reduction writes its products as its stages end.
 
-    Until it has finished, the folder also has the file unfinished.json, and ``fit.fits`` has the
-    derivatives, from which the reduction can go on.
-
-    Parameters
-    ----------
-    folder : path
-    derivatives : bool
-        Keep the derivatives in ``fit.fits`` at the end.
-    figures : {"pdf", "png", "svg"}, optional
-        Write every figure of the report to a file of this format at the end.
-    overwrite : bool
-        Replace the products of an earlier reduction.
-    resume : bool
-        Go on with a reduction that was interrupted, if there is one in the folder.
-
-    Raises
-    ------
-    ExistingFileError
-        If there are products in the folder, and neither `overwrite` nor `resume` allows it; it is
-        also an `OSError`.
+    Until it has finished, the folder also has the file unfinished.json, and ``fit.fits`` the
+    derivatives, from which the reduction can go on; `derivatives` and `figures` are for the end.
+    Raises ExistingFileError if there are products that neither `overwrite` nor `resume` allows.
     """
 
     def __init__(
@@ -427,12 +368,8 @@ class ProductFolder:
     def begin(self, sequence: Sequence, opd: OPDMap, options: Any) -> Checkpoint | None:
         """Return what an interrupted reduction of the same frames has done; else None.
 
-        Raises
-        ------
-        IncompatibleSetupError
-            If the folder has an interrupted reduction of other frames, or with other options.
-        CorruptFileError
-            If one of its files is damaged.
+        Raises IncompatibleSetupError if that was of other frames or with other options, and
+        CorruptFileError if one of its files is damaged.
         """
         fingerprint = _fingerprint(sequence, opd, options)
         self._facts = {"version": __version__, "fingerprint": fingerprint, "done": []}
@@ -533,17 +470,7 @@ def _fingerprint(sequence: Sequence, opd: OPDMap, options: Any) -> str:
 def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ()) -> list[Path]:
     """Write ``report.html``, one page that needs no other file, and ``summary.json``.
 
-    Parameters
-    ----------
-    reduction : Reduction
-    folder : Path
-        Made if it does not exist. Files of these names are replaced.
-    files : iterable of path
-        Other products, which the page lists.
-
-    Returns
-    -------
-    list of Path
+    Files of these names are replaced. The page lists `files`, other products.
     """
     overview = Overview(SkyImages(reduction), Klip.of(reduction))
     return _write_page(*_shown(reduction, overview), folder, files)

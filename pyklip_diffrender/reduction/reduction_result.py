@@ -34,25 +34,13 @@ _NEAR = 1.5
 
 
 def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
-    """Say how candidates are arranged like extended light.
+    """Say how candidates are arranged like extended light; empty if they may be so by chance.
 
-    Sources that have nothing to do with each other have independent position angles, and are
-    spread evenly over the field. The number of candidates alone says nothing.
-
-    Parameters
-    ----------
-    candidates : QTable
-        Columns x and y from the star, and frame_angle.
-    resolution : float
-        lambda/D, arcsec.
-    edge : float
-        Largest separation that was searched, arcsec.
-
-    Returns
-    -------
-    str
-        Empty if the candidates may be where they are by chance.
+    `candidates` has x and y from the star, and frame_angle; `resolution` is lambda/D and `edge` the
+    largest separation that was searched, arcsec.
     """
+    # Sources that have nothing to do with each other have independent position angles, and are
+    # spread evenly over the field. The number of candidates alone says nothing.
     count = len(candidates)
     if count < 2:
         return ""
@@ -66,6 +54,8 @@ def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
             return "The candidates are in line with the star, like an edge-on disk"
     places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
     distances = np.hypot(*(places[:, None] - places).T)[np.triu_indices(count, 1)]
+    # Each of the n (n - 1) / 2 pairs is within reach of each other with the probability
+    # (reach / edge)^2, the ratio of two areas, so that their number is nearly Poisson's.
     reach = _NEAR * resolution
     expected = len(distances) * (reach / edge) ** 2
     if stats.poisson.sf((distances < reach).sum() - 1, expected) < _UNLIKELY:
@@ -74,21 +64,10 @@ def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
 
 
 def on_extended_light(candidates: QTable, offsets: NDArray[np.float64], resolution: float) -> str:
-    """Say which candidates lie on extended light that was fitted.
+    """Say which candidates lie on extended light that was fitted; empty if none does.
 
-    Parameters
-    ----------
-    candidates : QTable
-        Columns x, y and separation.
-    offsets : ndarray, (k, 2)
-        x, y of the sources of the extended light from the star, arcsec.
-    resolution : float
-        lambda/D, arcsec.
-
-    Returns
-    -------
-    str
-        Empty if there is none.
+    `candidates` has x, y and separation. `offsets` (k, 2) are x, y of the sources of the extended
+    light from the star; `resolution` is lambda/D, arcsec.
     """
     if not len(candidates) or not len(offsets):
         return ""

@@ -63,33 +63,19 @@ def compare_reductions(
 ) -> list[dict[str, Any]]:
     """Compare the candidates of pairs of reductions, of several epochs or filters.
 
-    A companion stays where it is beside the star, apart from its orbit. A source in the background
-    stays on the sky, and moves opposite to the star's proper motion beside it; its parallax is
-    neglected, as is the star's, which moves it by at most twice the parallax.
-
-    Parameters
-    ----------
-    summaries : sequence of dict
-        Those of `summarise`, in order of time.
-    motion : tuple of float or None
-        Proper motion of the star, mu_alpha cos(delta) and mu_delta, arcsec per year; None if it is
-        not known, and then no source in the background is recognised.
-
-    Returns
-    -------
-    list of dict
-        For every pair of candidates that may be one source: the `reductions`, numbered from 0,
-        their `dates` and `filters`, the numbers of the candidates in their tables, counted from 1,
-        how far the position changed (`moved_arcsec` to the east and north), chi-squared of both
-        explanations (two degrees of freedom), the colour (magnitude in the first filter minus that
-        in the second, and its error; None for one filter, and where it is not known), and the
-        `verdict`.
+    `summaries` are those of `summarise` in order of time; `motion` is the proper motion of the
+    star, mu_alpha cos(delta) and mu_delta, arcsec per year: without it no source in the background
+    is recognised. Returns a dict for every pair of candidates that may be one source.
     """
     pairs = []
     for (i, first), (j, second) in combinations(enumerate(summaries), 2):
         if not (first["oriented"] and second["oriented"]):
             continue
         years = (second["epoch_mjd"] - first["epoch_mjd"]) / _YEAR
+        # Hypotheses about d, by which the place beside the star has changed, with covariance C: a
+        # companion stays, apart from its orbit (chi-squared d C^-1 d), and a source in the
+        # background moves opposite to the star, d = -mu t. Parallaxes are neglected: the star's
+        # moves such a source by at most twice the parallax.
         sky = None if motion is None else -np.array(motion) * years
         for k, one in enumerate(first["candidates"], 1):
             for m, other in enumerate(second["candidates"], 1):
@@ -102,12 +88,12 @@ def compare_reductions(
                 colour, error = _colour(first, one, second, other)
                 pairs.append(
                     {
-                        "reductions": [i, j],
+                        "reductions": [i, j],  # from 0
                         "dates": [str(each["first_date"])[:10] for each in (first, second)],
                         "filters": [first["filter"], second["filter"]],
-                        "candidates": [k, m],
-                        "moved_arcsec": [float(each) for each in moved],
-                        "chi2_with_star": star,
+                        "candidates": [k, m],  # numbers in the tables, from 1
+                        "moved_arcsec": [float(each) for each in moved],  # to the east and north
+                        "chi2_with_star": star,  # of two degrees of freedom, as the next
                         "chi2_with_sky": away,
                         "colour_mag": colour,
                         "colour_error_mag": error,
@@ -142,21 +128,8 @@ def sources_of(
 ) -> list[dict[str, Any]]:
     """Group the candidates that the filters of one epoch have at one place.
 
-    Parameters
-    ----------
-    summaries : sequence of dict
-        As for `compare_reductions`.
-    pairs : sequence of dict
-        What that returned.
-
-    Returns
-    -------
-    list of dict
-        For every source of an epoch with several filters: the `date`, and `filters`, a list with
-        for each reduction of the epoch its number from 0 (`reduction`), the `filter`, the numbers
-        of its `candidates` in the table, and, where there are none, the `limit`: the contrast of a
-        source at that separation that would have been a candidate (None if the curve does not
-        reach it).
+    `pairs` are what `compare_reductions` returned. There is a dict for every source of an epoch
+    with several filters: its date, and what `_in_filter` says of each reduction of the epoch.
     """
     nodes = [(i, k) for i, each in enumerate(summaries) for k in range(len(each["candidates"]))]
     number = {node: n for n, node in enumerate(nodes)}
@@ -168,6 +141,7 @@ def sources_of(
     if not nodes:
         return []
     first, second = np.array(links, dtype=int).reshape(-1, 2).T
+    # A source makes several pairs in three filters: it is a connected part of the graph of pairs.
     graph = coo_array((np.ones(len(links)), (first, second)), shape=(len(nodes), len(nodes)))
     _, labels = connected_components(graph, directed=False)
     sources = []
@@ -194,6 +168,7 @@ def _in_filter(
     number: int, summary: Mapping[str, Any], candidates: Sequence[int], separation: float
 ) -> dict[str, Any]:
     curve = summary["contrast_curve"]
+    # The contrast at that separation that would have been a candidate; None beyond the curve.
     limit = None
     if not candidates and len(curve["separation_arcsec"]):
         places = np.array(curve["separation_arcsec"], dtype=float)
@@ -232,6 +207,8 @@ def _covariance(candidate: Mapping[str, Any]) -> NDArray[np.float64]:
     angle = np.deg2rad(candidate["position_angle_deg"])
     along = candidate["separation_error_arcsec"]
     across = candidate["separation_arcsec"] * np.deg2rad(candidate["position_angle_error_deg"])
+    # C = T diag(s_along^2, s_across^2) T^T: the columns of T point away from the star, and across,
+    # to the east and north.
     turn = np.array([[np.sin(angle), np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
     scales = np.diag([along**2 + _FLOOR**2, across**2 + _FLOOR**2])
     return np.asarray(turn @ scales @ turn.T)
@@ -245,21 +222,9 @@ def write_comparison(
 ) -> list[Path]:
     """Write ``comparison.html`` and ``comparison.json``, above the products of every reduction.
 
-    Parameters
-    ----------
-    folders : mapping of str to dict
-        Summaries by the name of their folder, in order of time.
-    motion : tuple of float or None
-        Proper motion of the star, see `compare_reductions`.
-    folder : path
-        That the folders are in.
-    combination : Combination or str, optional
-        The search of all reductions together, or why there is none. ``comparison.json`` has it as
-        `combined`.
-
-    Returns
-    -------
-    list of Path
+    `folders` has the summaries by the name of their folder, in order of time, `motion` is as for
+    `compare_reductions`, and `combination` the search of all reductions together, or why there is
+    none.
     """
     summaries = list(folders.values())
     pairs = compare_reductions(summaries, motion)
@@ -371,6 +336,8 @@ def _tracks(
                     _name(each),
                     np.array(offsets).reshape(-1, 2),
                     np.array(errors).reshape(-1, 2),
+                    # A source in the background moves opposite to the star's proper motion beside
+                    # it.
                     None if _together(start, each) else place - np.array(motion) * years,
                 )
             )
@@ -392,18 +359,10 @@ def _tracks(
 
 
 def combined_rows(combined: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Title and cells of a table with the candidates of a search over filters and epochs.
+    """Title and rows of cells of a table with the candidates of a search over filters and epochs.
 
-    Parameters
-    ----------
-    combined : dict
-        What `Combination.to_dict` returned, also after it was read from ``comparison.json``.
-
-    Returns
-    -------
-    title : list of str
-    rows : list of list of str
-        One for each candidate.
+    `combined` is what `Combination.to_dict` returned, also after it was read from
+    ``comparison.json``.
     """
     candidates = combined["candidates"]
     dated = any("verdict" in each for each in candidates)

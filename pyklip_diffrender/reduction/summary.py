@@ -34,16 +34,8 @@ _LIBRARIES = ("torch", "numpy", "scipy", "astropy", "photutils", "matplotlib")
 def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any]:
     """Return what a reduction shows as nested dicts and lists of plain values.
 
-    Parameters
-    ----------
-    reduction : Reduction
-    klip : QTable, optional
-        Contrast curve of KLIP for the same frames.
-
-    Returns
-    -------
-    dict
-        Keys end in the unit of their values; None stands for what is not known.
+    `klip` is KLIP's contrast curve of the same frames. Keys end in the unit of their values; None
+    stands for what is not known.
     """
     sequence, detection = reduction.sequence, reduction.detection
     fit = reduction.fit
@@ -265,6 +257,7 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
     separation = curve["separation"].to_value("arcsec")
     inside = [s for s in _LIMITS if separation[0] - 1e-6 <= s <= separation[-1] + 1e-6]
     rows = []
+    # Limits fall by orders of magnitude with the separation: their logarithms are interpolated.
     for separation_arcsec in inside or [separation[-1]]:
         values = {
             name: float(np.exp(np.interp(separation_arcsec, separation, np.log(curve[name]))))

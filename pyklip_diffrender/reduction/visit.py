@@ -99,56 +99,31 @@ _FRAME = 2.2
 
 @dataclass(frozen=True)
 class Contribution:
-    """What a frame of a reference star was used for.
+    """What a frame of a reference star was used for."""
 
-    Attributes
-    ----------
-    name : str
-        Name of its file.
-    star : str
-    use : {"joint", "pattern", "left out"}
-        In one likelihood with the target; for the flat-field pattern only; or not at all.
-    reason : str
-        Why it was not used, or not all of its pixels; else empty.
-    chi2 : float
-        Chi-squared per pixel in the joint fit; NaN without one.
-    flux : float
-        Flux of its star over the target's; NaN without a joint fit.
-    drift : float
-        Rms of the difference of its wavefront from that of the target's first frame, nm; NaN
-        without a joint fit.
-    """
-
+    # Name of its file.
     name: str
     star: str
+    # "joint": in one likelihood with the target; "pattern": for the pattern only; or "left out".
     use: str
+    # Why it was not used, or not all of its pixels; else empty.
     reason: str = ""
+    # Per pixel in the joint fit; like the following NaN without one.
     chi2: float = math.nan
+    # Of its star, over the target's.
     flux: float = math.nan
+    # Rms of the difference of its wavefront from that of the target's first frame, nm.
     drift: float = math.nan
 
 
 @dataclass(frozen=True)
 class Visit:
-    """What the frames of reference stars have brought to a reduction.
+    """What the frames of reference stars have brought to a reduction."""
 
-    Attributes
-    ----------
-    contributions : tuple of Contribution
-        One for each frame of a reference star.
-    gain : float
-        Limits of the target's frames alone over those of the fit that was kept, in units of flux:
-        the median over separations from 0.4 to 2 arcsec. NaN if the frames were not fitted
-        together.
-
-    Examples
-    --------
-    >>> from pyklip_diffrender.reduction import Contribution, Visit
-    >>> Visit((Contribution("a.fits", "HD 2", "joint", chi2=0.98, flux=2.0, drift=1.4),), 1.3)
-    <Visit: 1 of 1 reference frames in the likelihood, limits 1.30 times deeper>
-    """
-
+    # One for each frame of a reference star.
     contributions: tuple[Contribution, ...] = ()
+    # Limits of the target's frames alone over those of the fit that was kept, in units of flux: the
+    # median over separations from 0.4 to 2 arcsec. NaN if the frames were not fitted together.
     gain: float = math.nan
 
     def __repr__(self) -> str:
@@ -171,20 +146,11 @@ class Visit:
 
 
 class Joined(NamedTuple):
-    """The fit of a target that was kept, with or without the frames of reference stars.
+    """The fit of a target that was kept, with or without the frames of reference stars."""
 
-    Attributes
-    ----------
-    fit : Refinement
-        The target's frames come first.
-    visit : Visit
-    detection : Detection or None
-        Its search, if there was one.
-    """
-
-    fit: Refinement
+    fit: Refinement  # the target's frames come first
     visit: Visit
-    detection: Detection | None = None
+    detection: Detection | None = None  # its search, if there was one
 
 
 def rough_settings(settings: GaussNewton) -> GaussNewton:
@@ -201,27 +167,11 @@ def with_references(
     memory: float | None = None,
     progress: bool = False,
 ) -> Joined:
-    """Fit the frames of reference stars together with those of the target.
+    """Fit the frames of reference stars, cut like the target's, together with those of the target.
 
-    Parameters
-    ----------
-    fit : Refinement
-        Of the target's frames alone.
-    choice : PatternChoice
-        Its flat-field pattern.
-    references : sequence of Observation
-        Cut like the target's frames.
-    search : callable, optional
-        Searches a fit. With it, limits are compared as they are stated, with errors scaled to the
-        scatter of the S/N; by default, as the linear models predict them.
-    memory : float, optional
-        Bytes that the process may take; frames that do not fit are left out.
-    progress : bool
-        Show progress bars.
-
-    Returns
-    -------
-    Joined
+    `choice` has the pattern of `fit`, that of the target alone. Limits are compared as `search`
+    states them, with errors scaled to the scatter of the S/N, else as the linear models predict
+    them. Frames that do not fit into `memory`, bytes of the process, are left out.
     """
     if not references or not fit.status.usable:
         return Joined(fit, Visit())
@@ -244,6 +194,8 @@ def with_references(
     joint: Refinement | None = None
     remarks: dict[str, str] = {}
     with stage("reference stars and target together"):
+        # Each round masks the companions that the joint fit shows, or else leaves out the frames
+        # that it does not explain, until there are neither.
         for _ in range(_ROUNDS):
             joint = None
             if not used:
@@ -274,6 +226,7 @@ def with_references(
     searches = None if search is None else (search(fit), search(joint))
     gain = _gain(fit, joint) if searches is None else _stated_gain(*searches)
     _log.info("limits with the reference frames are %.2f times deeper than without", gain)
+    # Deeper limits of a fit whose errors are not calibrated are no gain over one whose are.
     if gain > 1 and (joint.status.calibrated or not fit.status.calibrated):
         visit = Visit(_contributions(joint, references, left_out, remarks), gain)
         return Joined(joint, visit, searches and searches[1])
@@ -306,6 +259,8 @@ def _that_fit_into(
     """As many frames as the memory allows, those nearest in time to the target first."""
     if memory is None:
         return list(references)
+    # A frame's derivatives are in single precision, four bytes each, and it takes `_FRAME` times
+    # them.
     derivatives = 4.0 * fit.linear.frames[0].jacobian.numel()
     spare = fit.settings.memory_beside(len(fit.frames) * derivatives) / (_FRAME * derivatives)
     date = fit.frames[0].observation.date
@@ -353,11 +308,9 @@ def _aligned(
 
 
 def _unexplained(aligned: Refinement) -> float:
-    """Part of the star's light in a pixel that a fit of one frame leaves, robust to companions.
-
-    With the residual r, the noise s and the star's light l of a pixel, it is the k for which
-    r^2 / (s^2 + k^2 l^2) has the median of the square of a normal deviate.
-    """
+    """Part of the star's light in a pixel that a fit of one frame leaves, robust to companions."""
+    # With the residual r, the noise s and the star's light l of a pixel, it is the k for which
+    # r^2 / (s^2 + k^2 l^2) has the median of the square of a normal deviate.
     (frame,) = aligned.frames
     observation = frame.observation.combined()
     valid = observation.valid[0]
@@ -381,6 +334,7 @@ def _frame_chi2(fit: Refinement) -> NDArray[np.float64]:
         valid, noise = observation.valid[0], observation.error[0]
         if fit.systematics is not None:
             light = frame.star - frame.values["background"][0] + frame.pedestal
+            # The pattern's error multiplies star and pedestal, as the pattern does.
             noise = np.hypot(noise, fit.systematics.at(observation)[1] * light)
         residual = observation.data[0] - frame.star - frame.companion_image
         values.append(float(np.mean((residual / noise)[valid] ** 2)))
@@ -388,12 +342,10 @@ def _frame_chi2(fit: Refinement) -> NDArray[np.float64]:
 
 
 def _contradicting(joint: Refinement, science: int) -> dict[str, str]:
-    """Frames of reference stars that are not explained as the target's are, and why.
-
-    A frame that is far from the others spoils the fit of all. Those that are half as far are not
-    blamed yet.
-    """
+    """Frames of reference stars that are not explained as the target's are, and why."""
     values = _frame_chi2(joint)
+    # A frame that is far from the others spoils the fit of all. Those that are half as far are not
+    # blamed yet: the next joint fit, without the worst, shows whether they were.
     usual = max(1.0, float(np.median(values[:science])))
     limit = max(_EXCESS * usual, values[science:].max() / 2)
     reasons = {}
@@ -420,6 +372,7 @@ def _with_companions_masked(
         x, y = source.offset
         away = np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y)
         near = away < _MASKED * joint.model.resolution
+        # It was subtracted and masked in an earlier round.
         if not (observation.valid & near).any():
             continue
         is_new = True
@@ -440,6 +393,7 @@ def _with_companions_masked(
 
 def _gain(alone: Refinement, joint: Refinement) -> float:
     """Limits of one fit over those of another, in units of flux, the median over separations."""
+    # In units of flux, because the two fits may differ in that of the star.
     curves = []
     for fit in (alone, joint):
         edge = float(np.abs(fit.frames[0].grid).max())
@@ -450,7 +404,7 @@ def _gain(alone: Refinement, joint: Refinement) -> float:
 
 
 def _stated_gain(alone: Detection, joint: Detection) -> float:
-    """The same for limits as they are stated."""
+    """The same as `_gain` for limits as they are stated."""
     curves = []
     for detection in (alone, joint):
         curve = detection.contrast_curve

@@ -35,20 +35,10 @@ _MAGNITUDES = ("APPMAG", "APPMAG_ERR", "MSTAR", "MSTAR_ERR")
 
 
 def source_table(detection: Detection, product: Path) -> Table:
-    """Make the table of a product's sources, highest S/N first.
+    """Table of the sources in the file `product`, highest S/N first, as of `extract_companions`.
 
-    Parameters
-    ----------
-    detection : Detection
-    product : path
-        File that the sources are in.
-
-    Returns
-    -------
-    Table
-        Columns as in the tables that spaceKLIP's `extract_companions` makes: offsets in arcsec,
-        contrasts to the star. What depends on the star's magnitude is NaN, and so are the
-        throughputs, which the contrasts include.
+    Offsets are in arcsec, contrasts to the star. What depends on the star's magnitude is NaN, and
+    so are the throughputs, which the contrasts include.
     """
     table = detection.candidates
     count = len(table)
@@ -95,14 +85,7 @@ _COLUMNS = (
 def complete_header(product: Path, table: Table, mode: str) -> None:
     """Add the keywords of spaceKLIP's products, and a WCS, to the header of a product.
 
-    Parameters
-    ----------
-    product : path
-        Its pixels are turned to north.
-    table : Table
-        The concatenation.
-    mode : str
-        Subtraction mode, such as "ADI+RDI".
+    Its pixels are turned to north. `table` is the concatenation; `mode` is such as "ADI+RDI".
     """
     science = table[np.array(table["TYPE"], dtype=str) == "SCI"]
     frame = fits.getheader(science["FITSFILE"][0], "SCI")
@@ -127,16 +110,10 @@ def complete_header(product: Path, table: Table, mode: str) -> None:
 
 
 def write_rolls(product: Path, dataset: Any, files: Iterable[str | os.PathLike[str]]) -> None:
-    """Write the subtracted frames of every file, their median, beside the product of all.
+    """Write the median of the subtracted frames of every file beside the product of all.
 
-    Parameters
-    ----------
-    product : path
-        Its header is that of the rolls, too.
-    dataset : JWSTData
-        The reduced dataset.
-    files : iterable of path
-        Of the target; all frames of one have the same roll.
+    The header is that of the product. All frames of one of the `files`, of the target, have the
+    same roll.
     """
     header = fits.getheader(product)
     names = [Path(str(name)).name for name in dataset.filenames]
@@ -193,10 +170,7 @@ def write_database(path: Path, table: Table) -> None:
 def write_mask(path: Path, table: Table) -> None:
     """Write the transmission of the mask, turned to north, if the database has the rolls' masks.
 
-    Raises
-    ------
-    ImportError
-        If it has, and spaceKLIP, which turns them, is not installed.
+    Raises ImportError if it has, and spaceKLIP, which turns them, is not installed.
     """
     science = table[np.array(table["TYPE"], dtype=str) == "SCI"]
     if "NONE" in list(science["MASKFILE"]):

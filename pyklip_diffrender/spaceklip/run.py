@@ -44,16 +44,10 @@ logger = logging.getLogger(__name__)
 
 
 class Database(Protocol):
-    """The part of a `spaceKLIP.database.Database` that `run_obs` uses.
-
-    Attributes
-    ----------
-    output_dir : path
-    obs, red : dict of str to Table
-        Frames and products of every concatenation.
-    """
+    """The part of a `spaceKLIP.database.Database` that `run_obs` uses."""
 
     output_dir: str
+    # Frames and products of every concatenation.
     obs: dict[str, Table]
     red: dict[str, Table]
 
@@ -238,15 +232,7 @@ def why_unsupported(table: Table) -> str | None:
 def _admitted(key: str, table: Table) -> tuple[Table, JudgedFiles]:
     """Rows of a concatenation whose files are used, and the files, which are opened once.
 
-    Raises
-    ------
-    DiffrenderError
-        See `Sequence.from_files`.
-
-    Warns
-    -----
-    DiffrenderWarning
-        For every file that is left out.
+    Raises as `Sequence.from_files`, and warns of every file that is left out.
     """
     paths = [Path(str(path)).absolute() for path in table["FITSFILE"]]
     opened: dict[Path, OpenedFile] = {}

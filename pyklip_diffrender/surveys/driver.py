@@ -204,16 +204,11 @@ class _Board:
         self.next = ended + _SHARE * (ended - began)
 
     def write(self) -> None:
-        """Write the tables and the page.
-
-        Raises
-        ------
-        IncompatibleSetupError
-            If the output cannot be written to.
-        """
+        """Write tables and page; raises IncompatibleSetupError if they cannot be written."""
         from pyklip_diffrender.surveys.survey_page import page
 
         text = page([(job, self.records.get(job.key)) for job in self.todo])
+        # Written beside the old ones and then moved: whoever reads them meanwhile gets whole files.
         folder = None
         try:
             folder = staging(self.output / "jobs", "tables")

@@ -51,6 +51,8 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
     """Reduce a sequence, perhaps with a planet in it, and write the products."""
     changes: dict[str, Any] = {"memory": memory}
     if job.injection is not None and job.base_folder is not None:
+        # The planet is added to the frames of the job without one, which has found the pattern and
+        # which frames of reference stars join: what differs is the planet.
         fit = Refinement.read(folder.parent / job.base_folder / "fit.fits")
         first = fit.frames[0].observation
         planet = _planet(job.injection, first.position_angle)
@@ -102,11 +104,9 @@ def _planet(injection: Injection, north: float) -> Planet:
 
 
 def _recovered(reduction: Reduction, planet: Injection, flux: float) -> dict[str, Any]:
-    """Measure an injected planet: its candidate, or else the position of the injection.
-
-    Its contrast is relative to a star of that flux.
-    """
+    """Measure an injected planet, as a contrast to a star of that flux."""
     detection = reduction.detection
+    # The planet's candidate, or else, without one, the flux at the place of the injection.
     place = _planet(planet, detection.north).offset
     measured = measured_planet(detection, place, flux)._asdict()
     return {key: value if math.isfinite(value) else None for key, value in measured.items()}
@@ -135,11 +135,7 @@ Work = Callable[[Job, Path], dict[str, Any]]
 
 
 def run_job(job: Job, jobs: Path, work: Work) -> Record:
-    """Run a job and publish its folder; returns its record.
-
-    A job that is there already is not run again. No error of the job goes through: its record
-    says that it failed, and why.
-    """
+    """Run a job and publish its folder; returns its record, which says if and why it failed."""
     final = jobs / job.folder
     known = read_record(final)
     if known is not None and known["status"] == "finished":
@@ -305,14 +301,9 @@ def with_dask(
 ) -> Iterator[tuple[Job, Record]]:
     """Run jobs on a cluster, by default on this machine; yields each with its record.
 
-    A job whose worker dies is given to another one, up to three times.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If dask.distributed is not installed, or no scheduler answers.
-    RefinementError
-        If the scheduler is lost. Jobs that are finished stay.
+    A job whose worker dies is given to another one, up to three times. Raises
+    IncompatibleSetupError without dask.distributed or an answering scheduler, RefinementError if
+    that is lost.
     """
     try:
         from dask import config

@@ -52,61 +52,36 @@ _DIGITS = 12
 
 @dataclass(frozen=True)
 class Injection:
-    """A planet to add to the frames.
-
-    Attributes
-    ----------
-    contrast : float
-    separation : float
-        arcsec.
-    angle : float
-        Position angle, degrees east of north.
-    """
+    """A planet to add to the frames."""
 
     contrast: float
-    separation: float
-    angle: float
+    separation: float  # arcsec
+    angle: float  # position angle, degrees east of north
 
 
 @dataclass(frozen=True)
 class Job:
-    """One reduction.
+    """One reduction."""
 
-    Attributes
-    ----------
-    key : str
-        Hash of the package's version, the content of the input files, and the options.
-    name : str
-        Name of the sequence, by default target and filter, with the date of the epoch if it has
-        several.
-    files : tuple of str
-        Frames.
-    opd : str
-        Wavefront map.
-    inputs : dict of str to str
-        SHA-256 of every file that is read.
-    target, filter : str or None
-    epoch : str or None
-        Date in the epoch, of a sequence that has several.
-    options : Options
-    injection : Injection or None
-    base : str or None
-        Key of the job whose fit an injection starts from.
-    version : str
-        Of the package.
-    """
-
+    # Hash of the package's version, the content of the input files, and the options.
     key: str
+    # Of the sequence, by default target and filter, with the date of the epoch if it has several.
     name: str
+    # Frames.
     files: tuple[str, ...]
+    # Wavefront map.
     opd: str
+    # SHA-256 of every file that is read.
     inputs: Mapping[str, str]
     target: str | None = None
     filter: str | None = None
+    # Date in the epoch, of a sequence that has several.
     epoch: str | None = None
     options: Options = field(default_factory=Options)
     injection: Injection | None = None
+    # Key of the job whose fit an injection starts from.
     base: str | None = None
+    # Of the package.
     version: str = __version__
 
     @property
@@ -132,10 +107,8 @@ class Job:
 def jobs_of(config: Config) -> list[Job]:
     """Return the jobs of a survey; every injection comes after the job that it starts from.
 
-    Raises
-    ------
-    IncompatibleSetupError
-        With everything that is wrong with the inputs, one line for each mistake.
+    Raises IncompatibleSetupError with everything that is wrong with the inputs, a line for each
+    mistake.
     """
     jobs: dict[str, Job] = {}
     problems = []
@@ -273,13 +246,7 @@ Record = dict[str, Any]
 
 
 def prepare(output: Path) -> Path:
-    """Make the folder of the jobs, and see that it can be written to.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If it cannot be.
-    """
+    """Make the folder of the jobs; raises IncompatibleSetupError if it cannot be written to."""
     jobs = output / "jobs"
     try:
         jobs.mkdir(parents=True, exist_ok=True)
@@ -303,10 +270,8 @@ def staging(jobs: Path, key: str) -> Path:
 
 @cache
 def _place() -> str:
-    """Where the numbers of processes mean what they mean for this process.
-
-    Containers may share the name of a host and count their processes apart.
-    """
+    """Where the numbers of processes mean what they mean for this process."""
+    # Containers may share the name of a host and count their processes apart.
     facts = [socket.gethostname()]
     with suppress(OSError):
         facts.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
@@ -315,11 +280,7 @@ def _place() -> str:
 
 
 def publish(folder: Path, final: Path) -> None:
-    """Rename the folder of a complete job.
-
-    A finished job that somebody else has published meanwhile stays: it has the same content. A
-    failed or damaged one is replaced.
-    """
+    """Rename the folder of a complete job; a failed or damaged one of that name is replaced."""
     while True:
         try:
             os.rename(folder, final)
@@ -327,6 +288,7 @@ def publish(folder: Path, final: Path) -> None:
         except OSError:
             if not final.exists():
                 raise
+        # Somebody else has published the job meanwhile: the same key stands for the same content.
         if finished(final):
             shutil.rmtree(folder)
             return
@@ -357,11 +319,9 @@ def write_record(folder: Path, job: Job, record: Mapping[str, Any]) -> Record:
 
 
 def encodable(value: Any) -> Any:
-    """Make the text in nested values such that UTF-8 can encode it.
-
-    Names of files, and messages that quote them, may have bytes of another encoding, which Python
-    keeps as surrogates and no table takes.
-    """
+    """Make the text in nested values such that UTF-8 can encode it."""
+    # Names of files, and messages that quote them, may have bytes of another encoding, which Python
+    # keeps as surrogates and no table takes.
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode("utf-8")
     if isinstance(value, Mapping):
@@ -375,6 +335,7 @@ def read_record(final: Path) -> Record | None:
     """Record of a published job; None if there is none, or not all of its products."""
     try:
         record = json.loads(read_text(final / RECORD))
+        # A job that was published is whole, but somebody may have removed or cut off files since.
         sizes = {name: (final / name).stat().st_size for name in record["products"]}
         whole = sizes == record["products"]
         whole &= record["job"]["key"].startswith(final.name.rpartition("_")[2])
@@ -401,11 +362,9 @@ def finished(final: Path) -> bool:
 
 
 def clean(jobs: Path) -> None:
-    """Remove what processes that are no more have left unfinished.
-
-    Only processes of this machine can be asked for. What others have left stays: their jobs may
-    run, and clocks may differ.
-    """
+    """Remove what processes of this machine that are no more have left unfinished."""
+    # Only processes of this machine can be asked for. What others have left stays: their jobs may
+    # run, and clocks may differ.
     elsewhere = 0
     for path in jobs.glob(".*@*"):
         owner, place = path.name.split("@", 1)

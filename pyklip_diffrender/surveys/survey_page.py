@@ -170,13 +170,7 @@ _NAMES = 3
 
 
 def page(rows: Rows) -> str:
-    """The page.
-
-    Parameters
-    ----------
-    rows : sequence of (Job, dict or None)
-        Jobs with their records; None for one that waits.
-    """
+    """The page of jobs with their records, None for one that waits."""
     states = [_status(record) for _, record in rows]
     done, failed, waiting = map(states.count, ("finished", "failed", "waiting"))
     parts = [f"{done} of {count(len(rows), 'job')} finished"]
