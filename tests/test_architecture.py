@@ -44,12 +44,9 @@ PACKAGES = (
 )
 """Top-level modules and packages in order: each imports only from those before it.
 
-Imports in functions and under TYPE_CHECKING count. One of them goes the other way: see `LATE`.
+Imports in functions and under TYPE_CHECKING count.
 Inside a package, and inside packages of that package, imports must form no circle.
 """
-
-LATE = ("reduction.reduction_result", "reduction.products")
-"""`Reduction.write` imports the products, which know the class, when it is called."""
 
 OWNERS = {
     "astroquery": ("archive",),
@@ -96,19 +93,6 @@ def imported_names(tree: ast.AST, inside: str) -> Iterator[tuple[int, str]]:
                 yield node.lineno, str(first.value)
 
 
-def method_lines(tree: ast.AST) -> set[int]:
-    """Lines inside the methods of classes."""
-    return {
-        node.lineno
-        for owner in ast.walk(tree)
-        if isinstance(owner, ast.ClassDef)
-        for method in owner.body
-        if isinstance(method, ast.FunctionDef)
-        for node in ast.walk(method)
-        if isinstance(node, ast.stmt)
-    }
-
-
 def violations(sources: dict[Path, str]) -> list[str]:
     """What is wrong with the imports of modules, given as path below the package and text."""
     found = []
@@ -123,14 +107,12 @@ def violations(sources: dict[Path, str]) -> list[str]:
             continue
         inside = ".".join([PACKAGE, *path.parts[:-1]])
         tree = ast.parse(sources[path])
-        late = method_lines(tree)
         for line, imported in imported_names(tree, inside):
             top, _, rest = imported.partition(".")
             owners = OWNERS.get(top)
             if owners and not any(f"{name}.".startswith(f"{owner}.") for owner in owners):
                 found.append(f"{path}:{line}: only {' and '.join(owners)} may import {top}")
-            is_late = name == LATE[0] and f"{rest}.".startswith(f"{LATE[1]}.") and line in late
-            if top != PACKAGE or is_late:
+            if top != PACKAGE:
                 continue
             other = rest.split(".")[0]
             if other not in PACKAGES:
@@ -242,16 +224,6 @@ def test_a_planted_violation_is_found(path: str, text: str, complaint: str) -> N
     found = violations({Path(path): text})
     assert len(found) == 1
     assert complaint in found[0]
-
-
-def test_one_circle_is_allowed_and_only_inside_a_method() -> None:
-    result, products = Path("reduction/reduction_result.py"), Path("reduction/products.py")
-    back = "from pyklip_diffrender.reduction.reduction_result import A"
-    late = METHOD.format("from pyklip_diffrender.reduction.products import write")
-    assert violations({result: late, products: back}) == []
-    assert len(violations({result: late.replace("class A:\n", "if True:\n"), products: back})) == 1
-    guarded = GUARDED.format("pyklip_diffrender.reduction.products import write")
-    assert len(violations({result: guarded, products: back})) == 1
 
 
 def test_a_planted_circle_is_found() -> None:

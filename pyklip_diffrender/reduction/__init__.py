@@ -5,11 +5,11 @@ from pyklip_diffrender.reduction.products import (
     PRODUCTS,
     UNFINISHED,
     ProductFolder,
+    Reduction,
     existing_products,
     write_products,
     write_report,
 )
-from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
     combined_rows,

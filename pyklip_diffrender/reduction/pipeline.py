@@ -41,8 +41,7 @@ from pyklip_diffrender.pattern import (
     choose_systematics,
     fit_with_pattern,
 )
-from pyklip_diffrender.reduction.products import Checkpoint, ProductFolder
-from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.products import Checkpoint, ProductFolder, Reduction
 from pyklip_diffrender.reduction.visit import Joined, rough_settings, with_references
 from pyklip_diffrender.refinement import (
     GaussNewton,
