@@ -504,7 +504,7 @@ class ProductFolder:
             tables.get("completeness"),
         )
 
-    def keep(self, stage_name: str, reduction: ReductionResult, choice: PatternChoice) -> None:
+    def keep(self, stage_name: str, reduction: Reduction, choice: PatternChoice) -> None:
         """Write the products so far, after a stage."""
         self._facts["done"] = sorted({*self._facts["done"], stage_name})
         self._facts["choice"] = {
@@ -526,7 +526,7 @@ class ProductFolder:
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(self._facts, indent=2) + "\n", encoding="utf-8")
 
-    def finish(self, reduction: ReductionResult) -> list[Path]:
+    def finish(self, reduction: Reduction) -> list[Path]:
         """Write all products; the reduction has finished."""
         return reduction.write(
             self.folder, overwrite=True, derivatives=self._derivatives, figures=self._figures
