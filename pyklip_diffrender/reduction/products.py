@@ -323,7 +323,7 @@ def write_products(
     return written
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Reduction(ReductionResult):
     """Result of `reduce`.
 

@@ -130,7 +130,10 @@ class ReferenceStar:
         measured = [each for each in measure_patterns(fit) if each.frame in names]
         return cls(
             wavefront=OPDMap(
-                fit.wavefront, first.date, first.target, hashlib.sha256(fit.wavefront).hexdigest()
+                fit.wavefront,
+                first.date,
+                first.target,
+                hashlib.sha256(fit.wavefront.tobytes()).hexdigest(),
             ),
             # The light of the star, by which a pedestal is changed, would double the file.
             patterns=PatternLibrary(tuple(replace(each, light=None) for each in measured)),
