@@ -574,7 +574,7 @@ def contrast_curve(
     Returns
     -------
     QTable
-        See `contrast.contrast_table`.
+        See `contrast_curve`.
 
     Raises
     ------
