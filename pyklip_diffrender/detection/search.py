@@ -574,7 +574,12 @@ def contrast_curve(
     Returns
     -------
     QTable
-        See `contrast_curve`.
+        One row for each separation (arcsec), with contrasts of a 5-sigma point source: the median
+        of the ring (``contrast``, also as ``delta_mag``), its ``lowest`` and ``highest`` value, the
+        median with the small-sample correction of measured errors (``small_sample``), and that of
+        a star whose image were known (``known_star``). All but the latter include
+        ``error_factor``, by which errors were multiplied; ``flux_density`` (Jy) is that of the
+        median, in the photometric calibration of the frames.
 
     Raises
     ------
