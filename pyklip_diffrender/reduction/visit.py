@@ -228,6 +228,10 @@ def with_references(
                 break
             left_out |= contradicting
             used = [each for each in used if each.name not in contradicting]
+        else:
+            joint = None
+            reason = "what contradicts the target in the frames of reference stars has no end"
+            left_out |= {each.name: reason for each in used}
     if joint is None or not joint.status.usable:
         return Joined(fit, Visit(_left_out(references, left_out)))
     searches = None if search is None else (search(fit), search(joint))
