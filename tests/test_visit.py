@@ -28,6 +28,7 @@ from pyklip_diffrender.reduction import (
     Visit,
     pipeline,
 )
+from pyklip_diffrender.reduction import visit as visits
 from pyklip_diffrender.reduction.visit import rough_settings, with_references
 from pyklip_diffrender.refinement import GaussNewton, Refinement, align_frame, join_frames, refine
 from pyklip_diffrender.refinement.solver import ModePriors, exposure_sequences
@@ -354,6 +355,20 @@ def test_a_resumed_reduction_knows_what_the_references_contributed(
     assert result.pattern == result.systematics.name == "the rolls themselves"
     products.finish(result)
     assert "1 of them in the likelihood" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_frames_that_never_agree_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(visits, "_ROUNDS", 2)
+    monkeypatch.setattr(
+        visits,
+        "_contradicting",
+        lambda joint, count: {joint.frames[count].observation.name: "it contradicts the others"},
+    )
+    fit, visit = joined(*(reference(k) for k in range(3)))
+    assert fit is alone()[1]
+    first, second, third = (each.reason for each in visit.contributions)
+    assert first == second == "it contradicts the others"
+    assert third.endswith("has no end")
 
 
 def test_a_single_roll_may_show_a_structure_of_the_detector() -> None:
