@@ -158,10 +158,9 @@ class Option:
         indent = " " * 4
         text = textwrap.fill(
             self.meaning,
-            width=92,
+            92,
             initial_indent=indent,
             subsequent_indent=indent,
-            break_long_words=False,
             break_on_hyphens=False,
         )
         return f"{self.name} : {self.stated_type}\n{text}"
@@ -181,125 +180,79 @@ Accuracy: TypeAlias = Literal["full", "quick"]
 class SharedOptions:
     """Options of a reduction that surveys have, too: plain values; see `ReduceOptions`."""
 
-    size: int = field(
-        default=80,
-        metadata={
-            "least": 8,
-            "meaning": "Side in pixels of the square about the star that is fitted.",
-            "expected": "a whole number of pixels, 8 or more",
-            "help": "Side of the fitted square about the star, pixels.",
-            "metavar": "N",
-        },
-    )
-    systematics: PatternRequest | str | os.PathLike[str] = field(
-        default="auto",
-        metadata={
-            "choices": ("auto", "references", "off"),
-            "path": True,
-            "stated_type": 'Systematics, PatternLibrary, path, "auto", "references" or "off"',
-            "meaning": """
-                Flat-field pattern, or a file with one (``systematics.fits``); or a library of
-                patterns to search besides the package's, its file, or a folder of such files.
-                "auto" takes the pattern of the package's library (see `known_systematics`), and
-                fits the reference stars only where there is none for these pixels; "references"
-                fits them in any case and uses both. A fit that shows less than half of a library's
-                pattern is repeated without libraries. If neither has the pattern, rolls on the
-                same pixels are assumed to have one of the usual strength in common. With "off"
-                there is no pattern.""",
-            "expected": "'auto', 'references', 'off', or an existing file or folder with patterns",
-            "help": """
-                Flat-field pattern: auto (the package's library, else the reference stars),
-                references (both), off, a folder or file of patterns to search besides the package's
-                (command learn), or a systematics.fits of an earlier reduction.""",
-            "metavar": "CHOICE",
-        },
-    )
-    references: References = field(
-        default="joint",
-        metadata={
-            "choices": get_args(References),
-            "meaning": """
-                What the frames of reference stars are for. With "joint" they are fitted together
-                with the target's, in one likelihood, if that makes the limits deeper; with
-                "pattern" they teach the flat-field pattern where the library has none; with "off"
-                they are not used. With `disk`, "joint" stands for "pattern".""",
-            "help": """
-                What the frames of reference stars are for: one likelihood with the target's, the
-                flat-field pattern, or nothing.""",
-        },
-    )
-    threshold: float = field(
-        default=5.0,
-        metadata={
-            "meaning": "S/N of a candidate.",
-            "help": "S/N of a candidate.",
-            "metavar": "S/N",
-        },
-    )
-    wide: bool = field(
-        default=False,
-        metadata={
-            "meaning": """
-                Search the whole frames as well, see `wide_field`. If sources beyond the fitted
-                pixels are bright enough to be seen in these, the star is fitted once more without
-                their light.""",
-            "help": "Search the whole frames as well, to their edge.",
-        },
-    )
-    disk: bool = field(
-        default=False,
-        metadata={
-            "meaning": """
-                Fit extended light about the star, see `fit_disk`, and search the frames without
-                it. The limits are those of the positions where a planet would not be taken for a
-                part of it.""",
-            "help": "Fit extended light about the star, such as a disk, together with the star.",
-        },
-    )
-    completeness: bool = field(
-        default=False,
-        metadata={
-            "meaning": """
-                Compute the fraction of planets that the search finds, by contrast and separation;
-                see `completeness`. Takes a few minutes for two rolls.""",
-            "help": """
-                Compute the fraction of planets that the search finds, by contrast and separation.
-                Takes a few minutes for two rolls.""",
-        },
-    )
-    star_flux: float | str | u.Quantity | None = field(
-        default=None,
-        metadata={
-            "kind": float,
-            "text": True,
-            "stated_type": "float, str or Quantity, optional",
-            "meaning": """
-                Flux density of the star in the filter, from a catalogue or a model of its spectrum:
-                Jy, or an AB magnitude. Contrasts then refer to it, as spaceKLIP's do. By default
-                the light that is diffracted around the mask determines the star's flux, to 10 %,
-                which errors of contrasts include. Flux densities of planets do not depend on it.
-                Takes a second, shorter fit.""",
-            "expected": "a flux density in Jy, such as 0.45",
-            "help": """
-                Flux density of the star in the filter, such as "0.45 Jy", to which contrasts
-                refer; default: what diffracted light says, to 10 %.""",
-            "metavar": "FLUX",
-            "section": "Brightness of the star",
-        },
-    )
-    star_flux_error: float = field(
-        default=0.05,
-        metadata={
-            "most": 1.0,
-            "meaning": """
-                Relative error of `star_flux`, at most 1, with that of the photometric calibration
-                of the frames.""",
-            "expected": "a relative error of at most 1, such as 0.05 for 5 %",
-            "help": "Relative error of --star-flux, at most 1.",
-            "metavar": "FRACTION",
-            "section": "Brightness of the star",
-        },
-    )
+    size: int = field(default=80, metadata={
+        "least": 8,
+        "meaning": "Side in pixels of the square about the star that is fitted.",
+        "expected": "a whole number of pixels, 8 or more",
+        "help": "Side of the fitted square about the star, pixels.",
+        "metavar": "N",
+    })  # fmt: skip
+    systematics: PatternRequest | str | os.PathLike[str] = field(default="auto", metadata={
+        "choices": ("auto", "references", "off"), "path": True,
+        "stated_type": 'Systematics, PatternLibrary, path, "auto", "references" or "off"',
+        "meaning": """Flat-field pattern, or a file with one (``systematics.fits``); or a library of
+            patterns to search besides the package's, its file, or a folder of such files. "auto"
+            takes the pattern of the package's library (see `known_systematics`), and fits the
+            reference stars only where there is none for these pixels; "references" fits them in any
+            case and uses both. A fit that shows less than half of a library's pattern is repeated
+            without libraries. If neither has the pattern, rolls on the same pixels are assumed to
+            have one of the usual strength in common. With "off" there is no pattern.""",
+        "expected": "'auto', 'references', 'off', or an existing file or folder with patterns",
+        "help": """Flat-field pattern: auto (the package's library, else the reference stars),
+            references (both), off, a folder or file of patterns to search besides the package's
+            (command learn), or a systematics.fits of an earlier reduction.""",
+        "metavar": "CHOICE",
+    })  # fmt: skip
+    references: References = field(default="joint", metadata={
+        "choices": get_args(References),
+        "meaning": """What the frames of reference stars are for. With "joint" they are fitted
+            together with the target's, in one likelihood, if that makes the limits deeper; with
+            "pattern" they teach the flat-field pattern where the library has none; with "off" they
+            are not used. With `disk`, "joint" stands for "pattern".""",
+        "help": """What the frames of reference stars are for: one likelihood with the target's, the
+            flat-field pattern, or nothing.""",
+    })  # fmt: skip
+    threshold: float = field(default=5.0, metadata={
+        "meaning": "S/N of a candidate.", "help": "S/N of a candidate.", "metavar": "S/N",
+    })  # fmt: skip
+    wide: bool = field(default=False, metadata={
+        "meaning": """Search the whole frames as well, see `wide_field`. If sources beyond the
+            fitted pixels are bright enough to be seen in these, the star is fitted once more
+            without their light.""",
+        "help": "Search the whole frames as well, to their edge.",
+    })  # fmt: skip
+    disk: bool = field(default=False, metadata={
+        "meaning": """Fit extended light about the star, see `fit_disk`, and search the frames
+            without it. The limits are those of the positions where a planet would not be taken for
+            a part of it.""",
+        "help": "Fit extended light about the star, such as a disk, together with the star.",
+    })  # fmt: skip
+    completeness: bool = field(default=False, metadata={
+        "meaning": """Compute the fraction of planets that the search finds, by contrast and
+            separation; see `completeness`. Takes a few minutes for two rolls.""",
+        "help": """Compute the fraction of planets that the search finds, by contrast and
+            separation. Takes a few minutes for two rolls.""",
+    })  # fmt: skip
+    star_flux: float | str | u.Quantity | None = field(default=None, metadata={
+        "kind": float, "text": True, "stated_type": "float, str or Quantity, optional",
+        "meaning": """Flux density of the star in the filter, from a catalogue or a model of its
+            spectrum: Jy, or an AB magnitude. Contrasts then refer to it, as spaceKLIP's do. By
+            default the light that is diffracted around the mask determines the star's flux, to
+            10 %, which errors of contrasts include. Flux densities of planets do not depend on it.
+            Takes a second, shorter fit.""",
+        "expected": "a flux density in Jy, such as 0.45",
+        "help": """Flux density of the star in the filter, such as "0.45 Jy", to which contrasts
+            refer; default: what diffracted light says, to 10 %.""",
+        "metavar": "FLUX", "section": "Brightness of the star",
+    })  # fmt: skip
+    star_flux_error: float = field(default=0.05, metadata={
+        "most": 1.0,
+        "meaning": """Relative error of `star_flux`, at most 1, with that of the photometric
+            calibration of the frames.""",
+        "expected": "a relative error of at most 1, such as 0.05 for 5 %",
+        "help": "Relative error of --star-flux, at most 1.",
+        "metavar": "FRACTION", "section": "Brightness of the star",
+    })  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -334,94 +287,57 @@ class ReduceOptions(SharedOptions):
     0.45
     """
 
-    settings: GaussNewton | None = field(
-        default=None,
-        metadata={
-            "stated_type": "GaussNewton, optional",
-            "meaning": "Settings of the fits; default those of `refine`.",
-            "not_on_command_line": "an object of Python",
-            "not_in_surveys": "they have a table with the arguments of GaussNewton",
-        },
-    )
-    injections: int = field(
-        default=0,
-        metadata={
-            "meaning": """
-                Number of planets to add to the fitted frames, slightly brighter than the limits, to
-                see how well they are recovered; see `recover_planets`. Seven of them take as long
-                as the fit and the search, fewer where the fitted square is smaller than 80
-                pixels.""",
-            "help": """
-                Add N planets slightly brighter than the limits to the frames, and report how well
-                they are recovered. Seven take as long as the fit and the search.""",
-            "metavar": "N",
-            "not_in_surveys": "they have a table of planets, with a job for each",
-        },
-    )
-    accuracy: Accuracy = field(
-        default="full",
-        metadata={
-            "choices": get_args(Accuracy),
-            "stated_type": '"full" or "quick"',
-            "meaning": """
-                "quick" is for a first look: the model has fewer wavelengths and pupil samples, and
-                the fit fewer modes, all the fewer the fainter the star is compared with its noise.
-                For one roll of G 7-34 it took 0.7 of the time, and limits were 0.94 to 1.07 times
-                those of a full reduction; other stars were not measured. Not together with
-                `settings`.""",
-            "help": "A first look with a coarser model, in about two thirds of the time.",
-            "flag": "--quick",
-            "not_in_surveys": "they are no first look",
-        },
-    )
-    device: str = field(
-        default="cpu",
-        metadata={
-            "meaning": "PyTorch device of the optical model.",
-            "help": "PyTorch device of the optical model, such as cuda.",
-            "section": "General",
-            "not_in_surveys": "their workers compute on processors",
-        },
-    )
-    memory: float | str | u.Quantity | None = field(
-        default=None,
-        metadata={
-            "kind": float,
-            "text": True,
-            "stated_type": "float, str or Quantity, optional",
-            "meaning": """
-                Memory that the process may take, bytes or such as "2 GB"; see `GaussNewton`, whose
-                value it replaces.""",
-            "help": """
-                Memory that the process may take, such as "2 GB"; default: as much as it needs.""",
-            "metavar": "SIZE",
-            "not_in_surveys": "their memory_limit says how much a worker has",
-        },
-    )
-    start: Mapping[str, Any] | None = field(
-        default=None,
-        metadata={
-            "stated_type": "dict, optional",
-            "meaning": "Starting values of the fit by parameter name, as for `refine`.",
-            "not_on_command_line": "an object of Python",
-            "not_in_surveys": "it is for one set of frames",
-        },
-    )
-    max_chi2: float | None = field(
-        default=None,
-        metadata={
-            "kind": float,
-            "most": math.inf,
-            "stated_type": "float, optional",
-            "meaning": """
-                Reduced chi-squared of a fit above which the reduction stops with a
-                `RefinementError`; by default a fit that does not explain the frames is
-                reported.""",
-            "expected": "a positive number; inf for no limit",
-            "not_on_command_line": "the report says how well the fit explains the frames",
-            "not_in_surveys": "their table has the chi-squared of every job",
-        },
-    )
+    settings: GaussNewton | None = field(default=None, metadata={
+        "stated_type": "GaussNewton, optional",
+        "meaning": "Settings of the fits; default those of `refine`.",
+        "not_on_command_line": "an object of Python",
+        "not_in_surveys": "they have a table with the arguments of GaussNewton",
+    })  # fmt: skip
+    injections: int = field(default=0, metadata={
+        "meaning": """Number of planets to add to the fitted frames, slightly brighter than the
+            limits, to see how well they are recovered; see `recover_planets`. Seven of them take as
+            long as the fit and the search, fewer where the fitted square is smaller than 80
+            pixels.""",
+        "help": """Add N planets slightly brighter than the limits to the frames, and report how
+            well they are recovered. Seven take as long as the fit and the search.""",
+        "metavar": "N", "not_in_surveys": "they have a table of planets, with a job for each",
+    })  # fmt: skip
+    accuracy: Accuracy = field(default="full", metadata={
+        "choices": get_args(Accuracy), "stated_type": '"full" or "quick"',
+        "meaning": """
+            "quick" is for a first look: the model has fewer wavelengths and pupil samples, and the
+            fit fewer modes, all the fewer the fainter the star is compared with its noise. For one
+            roll of G 7-34 it took 0.7 of the time, and limits were 0.94 to 1.07 times those of a
+            full reduction; other stars were not measured. Not together with `settings`.""",
+        "help": "A first look with a coarser model, in about two thirds of the time.",
+        "flag": "--quick", "not_in_surveys": "they are no first look",
+    })  # fmt: skip
+    device: str = field(default="cpu", metadata={
+        "meaning": "PyTorch device of the optical model.",
+        "help": "PyTorch device of the optical model, such as cuda.",
+        "section": "General", "not_in_surveys": "their workers compute on processors",
+    })  # fmt: skip
+    memory: float | str | u.Quantity | None = field(default=None, metadata={
+        "kind": float, "text": True, "stated_type": "float, str or Quantity, optional",
+        "meaning": """Memory that the process may take, bytes or such as "2 GB"; see `GaussNewton`,
+            whose value it replaces.""",
+        "help": 'Memory that the process may take, such as "2 GB"; default: as much as it needs.',
+        "metavar": "SIZE", "not_in_surveys": "their memory_limit says how much a worker has",
+    })  # fmt: skip
+    start: Mapping[str, Any] | None = field(default=None, metadata={
+        "stated_type": "dict, optional",
+        "meaning": "Starting values of the fit by parameter name, as for `refine`.",
+        "not_on_command_line": "an object of Python",
+        "not_in_surveys": "it is for one set of frames",
+    })  # fmt: skip
+    max_chi2: float | None = field(default=None, metadata={
+        "kind": float, "most": math.inf, "stated_type": "float, optional",
+        "meaning": """Reduced chi-squared of a fit above which the reduction stops with a
+            `RefinementError`; by default a fit that does not explain the frames is reported.""",
+        "expected": "a positive number; inf for no limit",
+        "not_on_command_line": "the report says how well the fit explains the frames",
+        "not_in_surveys": "their table has the chi-squared of every job",
+    })  # fmt: skip
 
     def __post_init__(self) -> None:
         from pyklip_diffrender.io.units import to_bytes
