@@ -37,7 +37,6 @@ __all__ = [
     "ReduceOptions",
     "References",
     "SharedOptions",
-    "checked",
 ]
 
 
@@ -115,7 +114,7 @@ class Option:
             }.get(self.kind, f"one of {quoted}"),
             "flag": _flag(self.name),
         }
-        for name, usual in texts.items():
+        for name, usual in texts.items():  # Each in one line.
             text = " ".join((getattr(self, name) or usual).split())
             object.__setattr__(self, name, text)
 
@@ -126,7 +125,7 @@ class Option:
 
         Raises
         ------
-        ValueError
+        IncompatibleSetupError
             For a value that is not allowed.
         """
         if value is None and self.default is None:
@@ -144,7 +143,7 @@ class Option:
         else:
             return value
         if not allowed:
-            raise ValueError(f"got {value!r}, expected {self.expected}")
+            raise IncompatibleSetupError(f"{self.name}: got {value!r}, expected {self.expected}")
         return self.kind(value)
 
     @property
@@ -350,7 +349,7 @@ class ReduceOptions(SharedOptions):
         if self.memory is not None:
             plain["memory"] = to_bytes(self.memory, "memory")
         for name, value in plain.items():
-            object.__setattr__(self, name, checked(name, value))
+            object.__setattr__(self, name, OPTIONS[name].checked(value))
         if self.accuracy == "quick" and self.settings is not None:
             raise IncompatibleSetupError(
                 "accuracy, settings: got 'quick' and settings, expected one of them: a first look "
@@ -416,17 +415,3 @@ OPTIONS = {
 ReduceOptions.__doc__ = inspect.cleandoc(ReduceOptions.__doc__ or "").replace(
     "(see the fields)", "\n".join(each.entry for each in OPTIONS.values())
 )
-
-
-def checked(name: str, value: Any) -> Any:
-    """Return the plain value of an option as it is stored.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If it is not allowed.
-    """
-    try:
-        return OPTIONS[name].checked(value)
-    except ValueError as error:
-        raise IncompatibleSetupError(f"{name}: {error}") from None

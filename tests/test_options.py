@@ -17,7 +17,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender import options as module
 from pyklip_diffrender.cli import application
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.options import OPTIONS, ReduceKeywords, checked
+from pyklip_diffrender.options import OPTIONS, ReduceKeywords
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.spaceklip import run_obs
 from pyklip_diffrender.surveys.config import Options
@@ -122,7 +122,7 @@ def test_no_default_is_repeated() -> None:
 )
 def test_values_that_are_not_allowed(name: str, value: Any, words: str) -> None:
     with pytest.raises(IncompatibleSetupError) as raised:
-        checked(name, value)
+        OPTIONS[name].checked(value)
     assert words in str(raised.value)
     with pytest.raises(IncompatibleSetupError, match=f"^{name}: got"):
         ReduceOptions(**{name: value})

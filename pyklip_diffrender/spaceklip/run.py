@@ -22,7 +22,7 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
 )
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
-from pyklip_diffrender.options import ReduceOptions, checked
+from pyklip_diffrender.options import OPTIONS, ReduceOptions
 from pyklip_diffrender.pyklip_backend.dataset_frames import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.refinement import to_jansky
@@ -150,8 +150,8 @@ def run_obs(
     >>> spaceklip.run_obs(database, opd="maps")  # doctest: +SKIP
     """
     fluxes = _fluxes(star_flux or {}, database)
-    checked("threshold", threshold)
-    checked("star_flux_error", star_flux_error)
+    OPTIONS["threshold"].checked(threshold)
+    OPTIONS["star_flux_error"].checked(star_flux_error)
     folder = Path(database.output_dir) / subdir
     folder.mkdir(parents=True, exist_ok=True)
     products: dict[str, Path] = {}
