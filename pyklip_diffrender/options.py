@@ -111,7 +111,7 @@ class Option:
                 bool: "true or false",
                 int: f"a whole number, {self.least} or more",
                 float: "a positive number",
-            }.get(self.kind, f"one of {quoted}"),
+            }.get(self.kind, f"one of {', '.join(self.choices)}"),
             "flag": _flag(self.name),
         }
         for name, usual in texts.items():  # Each in one line.

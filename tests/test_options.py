@@ -115,7 +115,7 @@ def test_no_default_is_repeated() -> None:
         ("threshold", float("inf"), "a positive number"),
         ("threshold", None, "a positive number"),
         ("wide", "no", "wide: got 'no', expected true or false"),
-        ("references", "both", 'one of "joint", "pattern", "off"'),
+        ("references", "both", "one of joint, pattern, off"),
         ("star_flux_error", 5, "0.05 for 5 %"),
         ("max_chi2", 0, "inf for no limit"),
     ],
