@@ -14,7 +14,6 @@ import difflib
 import inspect
 import math
 import os
-import sys
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -88,7 +87,7 @@ class Option:
     meaning: str
     kind: type
     least: int = 0
-    most: float = sys.float_info.max
+    most: float = 1e30
     choices: tuple[str, ...] = ()
     path: bool = False
     text: bool = False

@@ -366,7 +366,8 @@ def option(*declarations: str, section: str = "Options", **settings: Any) -> Dec
 def declared(name: str, **changes: Any) -> Decorator:
     """The option of the command line for one of `ReduceOptions`."""
     each = OPTIONS[name]
-    settings = {"help": each.help, "metavar": each.metavar, "section": each.section}
+    settings: dict[str, Any] = {"help": each.help, "metavar": each.metavar}
+    settings["section"] = each.section
     if each.is_switch:
         settings["is_flag"] = True
     else:
