@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import MISSING, Field, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from astropy.table import Table
-from numpydoc.docscrape import NumpyDocString
 
-from pyklip_diffrender.cli import application
 from pyklip_diffrender.io.headers import KEYWORDS
-from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.options import OPTIONS
 
 __all__ = ["hard_cases", "keywords", "options", "scene_needs", "write_tables"]
 
@@ -26,29 +22,15 @@ GOOD = 0.03
 
 def options() -> list[list[str]]:
     """Rows for the options of `reduce`: name, default, option of the command line, meaning."""
-    described = {
-        name.strip(): (parameter.type, " ".join(parameter.desc))
-        for parameter in NumpyDocString(ReduceOptions.__doc__ or "")["Parameters"]
-        for name in parameter.name.split(",")
-    }
-    # An option without a description would leave a hole in the page.
-    missing = {each.name for each in fields(ReduceOptions)} - set(described)
-    assert not missing, f"ReduceOptions: {missing} are not in its section Parameters"
-    flags = {param.name: param.opts[0] for param in application.commands["reduce"].params}
     return [
         [
-            f"`{each.name}`: {described[each.name][0]}",
-            _default(each),
-            f"`{flags[each.name]}`" if each.name in flags else "",
-            described[each.name][1],
+            f"`{each.name}`: {each.stated_type}",
+            f"`{each.default!r}`",
+            "" if each.not_on_command_line else f"`{each.flag}`",
+            each.meaning,
         ]
-        for each in fields(ReduceOptions)
+        for each in OPTIONS.values()
     ]
-
-
-def _default(field: Field[Any]) -> str:
-    value = field.default_factory() if field.default is MISSING else field.default  # type: ignore[misc]
-    return f"`{value!r}`"
 
 
 def keywords() -> list[list[str]]:

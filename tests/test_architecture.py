@@ -34,6 +34,7 @@ PACKAGES = (
     "pattern",
     "detection",
     "imaging",
+    "options",
     "reduction",
     "pyklip_backend",
     "spaceklip",

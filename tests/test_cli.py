@@ -99,7 +99,7 @@ def test_help_of_a_command_has_sections_and_examples(
         (["detect", "x", "-o", "y", "--opd", "z", "--opd-date", "closest"], "nearest"),
         (["detect", "x", "-o", "y", "--opd", "z", "--threshold", "-3"], "--threshold: got -3"),
         (["detect", "x", "-o", "y", "--opd", "z", "--star-flux", "9 parsec"], "--star-flux: got"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--star-flux-error", "20"], "20 % are 0.2"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--star-flux-error", "20"], "0.05 for 5 %"),
         (["detect", "x", "-o", "y", "--opd", "z", "--memory", "2 lightyears"], "--memory: got"),
         (["reduce", "x", "-o", "y", "--opd", "z", "--star", "12"], "'12', expected x,y"),
         (["detect", "x", "-o", "y", "--opd", "z", "--disk", "--wide"], "--wide, --disk: got both"),

@@ -125,6 +125,7 @@ def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path:
     star = planned({**config, "sequence": [{**plain, "star_flux": 0.4}]})[0]
     assert (star.options.star_flux, star.options.star_flux_error) == (0.4, 0.05)
     assert star.key not in keys
+    assert planned({**config, "sequence": [{**plain, "references": "off"}]})[0].key not in keys
     config["options"] = {"disk": True}
     assert [job.options.disk for job in planned({**config, "sequence": [plain]})] == [True]
 

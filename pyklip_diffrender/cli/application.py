@@ -24,6 +24,7 @@ from pyklip_diffrender.cli.session import (
     Run,
     archive,
     common,
+    declared,
     file_type,
     free_memory,
     open_streams,
@@ -388,15 +389,7 @@ Examples:
 )
 @archive
 @wavefront
-@option(
-    "--size",
-    type=click.IntRange(min=8),
-    default=80,
-    show_default=True,
-    metavar="N",
-    section="Fit",
-    help="Side of the fitted square about the star, pixels.",
-)
+@declared("size", section="Fit")
 @outputs(file="FITS file for the library; finished fits are kept in a folder beside it.")
 @click.pass_obj
 def learn(

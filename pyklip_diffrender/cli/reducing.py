@@ -22,6 +22,7 @@ from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.instrument.spectrum import star_flux_density
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.progress import duration, numbered_stages, stage
+from pyklip_diffrender.options import Accuracy, ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternLibrary,
     combine_libraries,
@@ -33,7 +34,6 @@ from pyklip_diffrender.reduction import (
     PRODUCTS,
     UNFINISHED,
     ProductFolder,
-    ReduceOptions,
     existing_products,
     in_words,
     prepare,
@@ -204,7 +204,7 @@ def run_reduction(
     if star_sed is not None and options["star_flux"] is not None:
         raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
     try:
-        accuracy: Literal["full", "quick"] = "quick" if quick else "full"
+        accuracy: Accuracy = "quick" if quick else ReduceOptions.accuracy
         checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
         raise click.UsageError(with_options(str(error)) + config_remark()) from error

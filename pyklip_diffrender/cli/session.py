@@ -19,6 +19,7 @@ import click
 from click.core import ParameterSource
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.options import OPTIONS, ReduceOptions
 
 __all__ = [
     "COMMON",
@@ -28,6 +29,7 @@ __all__ = [
     "archive",
     "common",
     "config_remark",
+    "declared",
     "file_type",
     "free_memory",
     "open_streams",
@@ -66,20 +68,16 @@ PROGRAM = "pyklip-diffrender"
 _log = logging.getLogger(__name__)
 
 
-_ARGUMENTS = "|".join([
-    "completeness", "contrast", "disk", "filter", "hours", "injections", "mask", "memory",
-    "monochromatic", "offset", "opd", "overwrite", "program", "references", "resume", "separation",
-    "size",
-    "star_flux", "star_flux_error", "systematics", "target", "threshold", "wide",
-])  # fmt: skip
-"""Arguments that have the names of options of the command line."""
+_FLAGS: dict[str, str] = {}
+"""Options of all commands by the names of their arguments; filled where they are declared."""
+
+_AMBIGUOUS = "star"
+"""Name of an argument that in messages may also be what --star-sed says."""
 
 _OTHERS = {"image_mask": "mask"}
 """Arguments with other names than their options."""
 
 _BOTH = re.compile(r"\w+(=True)? \((--[\w-]+)( on the command line)?\)")
-_FIRST = re.compile(rf"(?<![\w.-])({_ARGUMENTS})(?=(, ({_ARGUMENTS}))*: )")
-_ASSIGNED = re.compile(rf"(?<![\w.-])({_ARGUMENTS})=(True|\.\.\.)")
 _CLASS = re.compile(r"\ban? [A-Z][a-z]+[A-Z]?\w*, (?=.* or )")
 _QUANTITY = re.compile(r" or an? [\w ]+ \([^()]* \* u\.\w+\)")
 
@@ -99,9 +97,10 @@ def with_options(message: str) -> str:
     for name, other in _OTHERS.items():
         message = message.replace(f"{name}: ", f"{other}: ")
     message = _QUANTITY.sub("", _CLASS.sub("", _BOTH.sub(r"\2", message)))
-    for pattern in (_FIRST, _ASSIGNED):
-        message = pattern.sub(lambda found: f"--{found[1].replace('_', '-')}", message)
-    return message
+    names = "|".join(sorted(_FLAGS, key=len, reverse=True))
+    first, assigned = rf"(?=(?:, (?:{names}))*: )", r"=(?:True|\.\.\.)"
+    named = rf"(?<![\w./-])({names})(?:{first}|{assigned})"
+    return re.sub(named, lambda found: _FLAGS[found[1]], message)
 
 
 class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
@@ -162,7 +161,7 @@ class Run:
     # Whether to show progress bars.
     progress: bool = False
     # Of PyTorch.
-    device: str = "cpu"
+    device: str = ReduceOptions.device
     # Whether names in messages are keys of a configuration file, as those of surveys, and no
     # options of the command line.
     configured: bool = False
@@ -331,11 +330,34 @@ class _Option(click.Option):
     def __init__(self, *declarations: Any, section: str = "Options", **settings: Any) -> None:
         super().__init__(*declarations, **settings)
         self.section = section
+        if self.name is not None and self.name != _AMBIGUOUS:
+            _FLAGS[self.name] = self.opts[-1]
 
 
 def option(*declarations: str, section: str = "Options", **settings: Any) -> Decorator:
     """An option, by default in the first section of the help."""
     return click.option(*declarations, cls=_Option, section=section, **settings)
+
+
+def declared(name: str, **changes: Any) -> Decorator:
+    """The option of the command line for one of `ReduceOptions`."""
+    each = OPTIONS[name]
+    settings: dict[str, Any] = {"help": each.help, "metavar": each.metavar}
+    settings["section"] = each.section
+    if each.is_switch:
+        settings["is_flag"] = True
+    else:
+        type_: Any = str if each.text else each.kind
+        if each.path:
+            # A path that is not converted: shells complete files, and a name stays as it is.
+            type_ = click.Path()
+        elif each.choices:
+            type_ = click.Choice(each.choices)
+        elif each.kind is int:
+            type_ = click.IntRange(min=each.least)
+        settings |= {"type": type_, "default": each.default}
+        settings["show_default"] = each.default is not None
+    return option(each.flag, **(settings | changes))
 
 
 def _all(*decorators: Decorator) -> Decorator:
@@ -500,8 +522,7 @@ common = _all(
     option("-q", "--quiet", is_flag=True, section=_GENERAL, help="Show no progress."),
     option("--log-file", type=file_type(), metavar="FILE", section=_GENERAL,
            help="Append the messages to this file, with their times."),
-    option("--device", default="cpu", show_default=True, section=_GENERAL,
-           help="PyTorch device of the optical model, such as cuda."),
+    declared("device"),
     option("--threads", type=click.IntRange(min=1), metavar="N", section=_GENERAL,
            help="Number of threads; default: PyTorch's choice."),
     option("--config", type=file_type(), metavar="FILE", section=_GENERAL, is_eager=True,
@@ -562,44 +583,15 @@ wavefront = _all(
 )  # fmt: skip
 
 search = _all(
-    option("--size", type=click.IntRange(min=8), default=80, show_default=True, metavar="N",
-           section="Fit and search", help="Side of the fitted square about the star, pixels."),
-    option("--threshold", type=float, default=5.0, show_default=True, metavar="S/N",
-           section="Fit and search", help="S/N of a candidate."),
-    option("--wide", is_flag=True, section="Fit and search",
-           help="Search the whole frames as well, to their edge."),
-    option("--disk", is_flag=True, section="Fit and search",
-           help="Fit extended light about the star, such as a disk, together with the star."),
-    option("--injections", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
-           section="Fit and search",
-           help="Add N planets slightly brighter than the limits to the frames, and report how "
-                "well they are recovered. Seven take as long as the fit and the search."),
-    option("--completeness", is_flag=True, section="Fit and search",
-           help="Compute the fraction of planets that the search finds, by contrast and "
-                "separation. Takes a few minutes for two rolls."),
-    option("--star-flux", metavar="FLUX", section="Fit and search",
-           help='Flux density of the star in the filter, such as "0.45 Jy", to which contrasts '
-                "refer; default: what diffracted light says, to 10 %."),
+    *(
+        declared(name) for name, each in OPTIONS.items()
+        if not each.not_on_command_line and each.section != _GENERAL
+    ),
     # A path that is not converted: shells complete files, and a name stays as it is.
-    option("--star-sed", type=click.Path(), metavar="FILE", section="Fit and search",
+    option("--star-sed", type=click.Path(), metavar="FILE", section="Brightness of the star",
            help="Spectrum or photometry of the star, in place of --star-flux: two columns in "
                 "micron and Jy, a table with units, or a VOTable of VizieR's photometry viewer. "
                 'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
-    option("--star-flux-error", type=float, default=0.05, show_default=True, metavar="FRACTION",
-           section="Fit and search", help="Relative error of --star-flux, at most 1."),
-    option("--systematics", type=click.Path(), default="auto", show_default=True,
-           metavar="CHOICE", section="Fit and search",
-           help="Flat-field pattern: auto (the package's library, else the reference "
-           "stars), references (both), off, a folder or file of patterns to search besides the "
-           "package's (command learn), or a systematics.fits of an earlier reduction."),
-    option("--references", type=click.Choice(("joint", "pattern", "off")), default="joint",
-           show_default=True, section="Fit and search",
-           help="What the frames of reference stars are for: one likelihood with the target's, the "
-           "flat-field pattern, or nothing."),
-    option("--quick", is_flag=True, section="Fit and search",
-           help="A first look with a coarser model, in about two thirds of the time."),
-    option("--memory", metavar="SIZE", section="Fit and search",
-           help='Memory that the process may take, such as "2 GB"; default: as much as it needs.'),
     option("--resume", is_flag=True, section="Output",
            help="Go on with a reduction that was interrupted: its fit and search are kept in the "
                 "folder of the products."),

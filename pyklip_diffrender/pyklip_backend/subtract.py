@@ -17,6 +17,7 @@ from torch import Tensor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import heard_by
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.options import OPTIONS, ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.dataset_frames import Pointing, pointings_of
 from pyklip_diffrender.scene.jwst_files import shift_frames
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.detection import Detection
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import PatternRequest
-    from pyklip_diffrender.reduction import ReduceOptions, Reduction
+    from pyklip_diffrender.reduction import Reduction
     from pyklip_diffrender.refinement import FrameFit, Refinement
 
 __all__ = [
@@ -350,20 +351,13 @@ def _options(
     settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
 ) -> ReduceOptions:
     """Options of the reduction; the settings that are None are those of `reduce`."""
-    from pyklip_diffrender.reduction import ReduceOptions
     from pyklip_diffrender.reduction.pipeline import MAX_CHI2
 
-    given: dict[str, Any] = {
-        "settings": settings.fit,
-        "start": settings.start,
-        "references": settings.references,
-        "threshold": settings.threshold,
-        "disk": settings.disk,
-        "star_flux": settings.star_flux,
-        "star_flux_error": settings.star_flux_error,
-        "systematics": _requested_pattern(settings, observation, references),
-        "max_chi2": MAX_CHI2 if settings.max_chi2 is None else settings.max_chi2,
-    }
+    given = {name: getattr(settings, name, None) for name in OPTIONS}
+    given["settings"] = settings.fit
+    given["systematics"] = _requested_pattern(settings, observation, references)
+    if given["max_chi2"] is None:
+        given["max_chi2"] = MAX_CHI2
     return ReduceOptions(**{key: value for key, value in given.items() if value is not None})
 
 

@@ -1,6 +1,7 @@
 """`reduce`: from a sequence of frames to planets, with a report."""
 
-from pyklip_diffrender.reduction.pipeline import Preparation, ReduceOptions, prepare, reduce
+from pyklip_diffrender.options import ReduceOptions
+from pyklip_diffrender.reduction.pipeline import Preparation, prepare, reduce
 from pyklip_diffrender.reduction.products import (
     PRODUCTS,
     UNFINISHED,

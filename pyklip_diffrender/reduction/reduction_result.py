@@ -12,6 +12,7 @@ from scipy import stats
 
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.reduction.visit import Visit
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.sequence import Sequence
@@ -105,7 +106,7 @@ class ReductionResult:
     disk: Disk | None = None
     injections: QTable | None = None
     completeness: QTable | None = None
-    accuracy: str = "full"
+    accuracy: str = ReduceOptions.accuracy
 
     @property
     def reference_frames(self) -> int:

@@ -22,7 +22,7 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
 )
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
-from pyklip_diffrender.io.units import require_bound
+from pyklip_diffrender.options import OPTIONS, ReduceOptions
 from pyklip_diffrender.pyklip_backend.dataset_frames import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.refinement import to_jansky
@@ -64,10 +64,10 @@ def run_obs(
     opd: Any,
     restrict_to: str | None = None,
     subdir: str = "diffrender",
-    threshold: float = 5.0,
+    threshold: float = ReduceOptions.threshold,
     save_rolls: bool = False,
     star_flux: Mapping[str, float | str | u.Quantity] | None = None,
-    star_flux_error: float = 0.05,
+    star_flux_error: float = ReduceOptions.star_flux_error,
     verbose: bool = False,
     **settings: Any,
 ) -> dict[str, Detection]:
@@ -144,7 +144,8 @@ def run_obs(
     >>> spaceklip.run_obs(database, opd="maps")  # doctest: +SKIP
     """
     fluxes = _fluxes(star_flux or {}, database)
-    require_bound(star_flux_error, "star_flux_error", "positive")
+    OPTIONS["threshold"].checked(threshold)
+    OPTIONS["star_flux_error"].checked(star_flux_error)
     folder = Path(database.output_dir) / subdir
     folder.mkdir(parents=True, exist_ok=True)
     products: dict[str, Path] = {}

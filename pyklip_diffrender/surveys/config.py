@@ -8,12 +8,14 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.units import full_circle
+from pyklip_diffrender.options import OPTIONS, SharedOptions
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
 __all__ = [
@@ -23,7 +25,6 @@ __all__ = [
     "Options",
     "SequenceConfig",
     "as_count",
-    "as_flag",
     "as_list",
     "as_number",
     "as_positive",
@@ -129,13 +130,6 @@ def as_number(value: Any) -> float:
     return float(value)
 
 
-def as_flag(value: Any) -> bool:
-    """True or false."""
-    if not isinstance(value, bool):
-        raise ValueError
-    return value
-
-
 def as_count(value: Any) -> int:
     """A whole number, 0 or more."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 1_000_000:
@@ -194,38 +188,15 @@ _SETTINGS = (
 
 
 @dataclass(frozen=True)
-class Options:
-    """Options of `ReduceOptions` for a sequence, as plain values.
+class Options(SharedOptions):
+    """Options of `ReduceOptions` for a sequence, as plain values: paths as text, and Jy.
 
     Attributes
     ----------
-    size : int
-    threshold : float
-    systematics : str
-        "auto", "references", "off", or the path of a file of `Systematics.write`, of a library of
-        patterns, or of a folder with such libraries.
-    references : str
-        "joint", "pattern" or "off", see `ReduceOptions`.
-    wide, disk, completeness : bool
-        Search the whole frames as well, fit extended light together with the star, and compute the
-        fraction of planets that the search finds.
-    star_flux : float or None
-        Flux density of the star, Jy.
-    star_flux_error : float
-        Its relative error.
     settings : dict
         Arguments of `GaussNewton.nircam`; empty for the defaults of `reduce`.
     """
 
-    size: int = 80
-    threshold: float = 5.0
-    systematics: str = "auto"
-    references: str = "joint"
-    wide: bool = False
-    disk: bool = False
-    completeness: bool = False
-    star_flux: float | None = None
-    star_flux_error: float = 0.05
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -405,49 +376,24 @@ def _sequence(
 
 
 def _options(table: CheckedTable, default: Options) -> Options:
-    size = table.take(
-        "size", default.size, "a number of pixels, 8 or more", only(as_count, lambda n: n >= 8)
-    )
-    threshold = table.take("threshold", default.threshold, "a positive number", as_positive)
+    def path(choices: tuple[str, ...], value: Any) -> str:
+        return str(value) if value in choices else str(table.existing(value))
 
-    def systematics(value: Any) -> str:
-        known = value in ("auto", "references", "off")
-        return str(value) if known else str(table.existing(value))
-
-    pattern = table.take(
-        "systematics", default.systematics,
-        "'auto', 'references', 'off', or an existing file or folder with patterns", systematics,
-    )  # fmt: skip
-    references = table.take(
-        "references", default.references, "'joint', 'pattern' or 'off'",
-        only(as_text, lambda use: use in ("joint", "pattern", "off")),
-    )  # fmt: skip
-    wide, disk, completeness = (
-        table.take(key, getattr(default, key), "true or false", as_flag)
-        for key in ("wide", "disk", "completeness")
-    )
-    if wide and disk:
+    values: dict[str, Any] = {}
+    for name in default.keywords:
+        each = OPTIONS[name]
+        convert = partial(path, each.choices) if each.path else each.checked
+        values[name] = table.take(name, getattr(default, name), each.expected, convert)
+    if values["wide"] and values["disk"]:
         table.complain("", "wide = true and disk = true", "one of them")
-        disk = False
-    star = table.take(
-        "star_flux", default.star_flux, "a flux density in Jy, such as 0.45", as_positive
-    )
-    star_error = table.take(
-        "star_flux_error",
-        default.star_flux_error,
-        "a relative error, such as 0.05",
-        only(as_positive, lambda error: error <= 1),
-    )
+        values["disk"] = False
     own = table.take("settings", {}, "a table with arguments of GaussNewton", as_table)
     # Those of a sequence come on top of the survey's.
     settings = {**default.settings, **own}
     wrong = _wrong_settings(settings) if own else []
     where = f"{table.place}: settings"
     table.problems += [f"{where}: {each}" for each in wrong]
-    allowed = default.settings if wrong else settings
-    return Options(
-        size, threshold, pattern, references, wide, disk, completeness, star, star_error, allowed
-    )
+    return Options(**values, settings=default.settings if wrong else settings)
 
 
 def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:

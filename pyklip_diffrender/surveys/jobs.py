@@ -43,8 +43,9 @@ __all__ = [
 ]
 
 
-_SWITCHES = ("wide", "disk", "completeness")
-"""Options that are named in the key of a job where they are on."""
+_ALWAYS = ("size", "threshold", "systematics", "settings")
+"""Options in the key of every job. Others are in it where they are not as usual, so that jobs of
+configurations without them keep their names."""
 
 _DIGITS = 12
 """Digits of the key at the end of the name of a folder."""
@@ -178,25 +179,30 @@ def _job(
     epoch: str | None,
     digest: Callable[[Path], str],
 ) -> Job:
-    pattern, star = sequence.options.systematics, sequence.options.star_flux
+    options, usual = sequence.options, Options()
+    pattern = str(options.systematics)
     known = [] if pattern in ("auto", "references", "off") else _files((Path(pattern),))
     maps = [] if str(opd) == FLAT else [opd]
     inputs = {str(path): digest(path) for path in (*files, *maps, *known)}
+    chosen = {
+        name: value
+        for name, value in vars(options).items()
+        if name in _ALWAYS or value != getattr(usual, name)
+    }
+    # The error has no effect without the flux.
+    chosen.pop("star_flux_error", None)
+    if options.star_flux is not None:
+        chosen["star_flux"] = [options.star_flux, options.star_flux_error]
     facts = {
+        **chosen,
         "version": __version__,
         "frames": sorted(inputs[str(path)] for path in files),
         "opd": inputs.get(str(opd), FLAT),
         "target": sequence.target,
         "filter": sequence.filter,
-        "size": sequence.options.size,
-        "threshold": sequence.options.threshold,
         "systematics": (
             inputs.get(pattern) or sorted(inputs[str(path)] for path in known) or pattern
         ),
-        "settings": dict(sequence.options.settings),
-        # Only where they are used, so that jobs of configurations without them keep their names.
-        **{name: True for name in _SWITCHES if getattr(sequence.options, name)},
-        **({} if star is None else {"star_flux": [star, sequence.options.star_flux_error]}),
         **({} if epoch is None else {"epoch": epoch}),
     }
     return Job(
@@ -208,7 +214,7 @@ def _job(
         sequence.target,
         sequence.filter,
         epoch,
-        sequence.options,
+        options,
     )
 
 
