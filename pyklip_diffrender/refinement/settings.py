@@ -58,7 +58,12 @@ _SHARES = ((100.0, 0.4), (4.0, 0.55), (0.0, 0.77))
 """Share of the spatial frequencies that a first look fits, by how many times the star is fainter
 than G 7-34, compared with its noise."""
 
-_QUICK = {"response_npix": 64, "response_wavelengths": 3, "tolerance": 1e-3, "relinearise": 0.3}
+_QUICK: dict[str, Any] = {
+    "response_npix": 64,
+    "response_wavelengths": 3,
+    "tolerance": 1e-3,
+    "relinearise": 0.3,
+}
 """Other settings of a first look. In single rolls of G 7-34 and HIP 17695 in F444W, limits from 0.4
 arcsec were 1.00 to 1.14 times those of full fits, and it took 0.5 to 0.7 of their time. Without
 accurate steps, limits are 1.3 times as large; with three wavelengths in the model, the fit does not
