@@ -17,13 +17,11 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from astropy.io import fits
-from astropy.time import Time
 
 from benchmarks.calints_files import calints
 from pyklip_diffrender import __version__
@@ -35,7 +33,7 @@ from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.reduction import UNFINISHED, Preparation, ReduceOptions
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront.opd import RULES, OPDMap, random_opd, resample
+from pyklip_diffrender.wavefront.opd import RULES, random_opd, resample
 
 # The package has the command under the name of its module.
 doctor = import_module("pyklip_diffrender.cli.application")
@@ -49,12 +47,12 @@ WAVELENGTH = ["--monochromatic", "4.5e-6"]
 
 
 @lru_cache(maxsize=1)
-def wavefront() -> np.ndarray:
+def wavefront():
     """A wavefront, nm."""
     return random_opd(3, npix=128).data * 1e9
 
 
-def opd_file(path: Path, unit: str | None = "nm") -> Path:
+def opd_file(path, unit="nm"):
     hdu = fits.PrimaryHDU(wavefront())
     if unit:
         hdu.header["BUNIT"] = unit
@@ -62,14 +60,14 @@ def opd_file(path: Path, unit: str | None = "nm") -> Path:
     return path
 
 
-def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_names_the_commands(capsys):
     assert main(["--help"]) == 0
     shown = capsys.readouterr().out
     for command in ("demo", "reduce", "detect", "psf", "doctor"):
         assert command in shown
 
 
-def test_threads_sleep_while_they_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_sleep_while_they_wait(monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", "active")
     assert main(["--version"]) == 0
     assert os.environ["OMP_WAIT_POLICY"] == "active"
@@ -79,9 +77,7 @@ def test_threads_sleep_while_they_wait(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("command", ["demo", "reduce", "detect", "psf"])
-def test_help_of_a_command_has_sections_and_examples(
-    capsys: pytest.CaptureFixture[str], command: str
-) -> None:
+def test_help_of_a_command_has_sections_and_examples(capsys, command):
     assert main([command, "-h"]) == 0
     shown = capsys.readouterr().out
     assert shown.index("\nOutput:") < shown.index("\nGeneral:")
@@ -113,13 +109,7 @@ def test_help_of_a_command_has_sections_and_examples(
         (["demo", "--separation", "9"], "--separation"),
     ],
 )
-def test_wrong_options_are_usage_errors(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    words: str,
-) -> None:
+def test_wrong_options_are_usage_errors(tmp_path, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
     shown = capsys.readouterr()
@@ -129,7 +119,7 @@ def test_wrong_options_are_usage_errors(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_does_not_wait_for_torch() -> None:
+def test_help_does_not_wait_for_torch():
     program = (
         "import sys, pyklip_diffrender.cli as cli\n"
         "cli.main(['--help'])\n"
@@ -146,9 +136,7 @@ def test_help_does_not_wait_for_torch() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_psf_writes_the_image_of_the_model(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_psf_writes_the_image_of_the_model(tmp_path, capsys):
     path = tmp_path / "star.fits"
     opd = opd_file(tmp_path / "opd.fits")
     arguments = ["psf", "-o", str(path), *WAVELENGTH, "--size", "20", "--opd", str(opd)]
@@ -185,13 +173,7 @@ def test_psf_writes_the_image_of_the_model(
     ],
     ids=["filter", "wavelength", "mask", "nan", "outside", "file"],
 )
-def test_errors_go_to_stderr_and_nothing_is_written(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    extra: list[str],
-    words: list[str],
-) -> None:
+def test_errors_go_to_stderr_and_nothing_is_written(tmp_path, monkeypatch, capsys, extra, words):
     monkeypatch.chdir(tmp_path)
     assert main(["psf", "-o", "star.fits", *extra]) == 1
     shown = capsys.readouterr()
@@ -204,9 +186,7 @@ def test_errors_go_to_stderr_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_map_without_a_unit_is_an_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_without_a_unit_is_an_error(tmp_path, capsys):
     opd = opd_file(tmp_path / "opd.fits", unit=None)
     product = tmp_path / "star.fits"
     assert main(["psf", "-o", str(product), *WAVELENGTH, "--opd", str(opd)]) == 1
@@ -215,9 +195,7 @@ def test_a_map_without_a_unit_is_an_error(
 
 
 @pytest.mark.parametrize("percent", [0, 50])
-def test_detect_in_a_broken_file_leaves_no_product(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], percent: int
-) -> None:
+def test_detect_in_a_broken_file_leaves_no_product(tmp_path, capsys, percent):
     frames, products = tmp_path / "calints.fits", tmp_path / "products"
     if percent:
         fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 90, 90)), name="SCI")]).writeto(
@@ -231,17 +209,12 @@ def test_detect_in_a_broken_file_leaves_no_product(
     assert not products.exists()
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"pyklip-diffrender {__version__}\n"
 
 
-# -- outputs that are there already --------------------------------------------------------------
-
-
-def test_an_image_is_replaced_only_when_told_to(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_image_is_replaced_only_when_told_to(tmp_path, capsys):
     path = tmp_path / "star.fits"
     path.write_text("mine")
     arguments = ["psf", "-o", str(path), *WAVELENGTH, "--size", "8"]
@@ -259,9 +232,7 @@ def test_an_image_is_replaced_only_when_told_to(
     ("command", "product"),
     [("demo", "demo.fits"), ("reduce", "detection.fits"), ("detect", "detection.fits")],
 )
-def test_products_are_refused_before_any_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, product: str
-) -> None:
+def test_products_are_refused_before_any_work(tmp_path, capsys, command, product):
     """The frames do not exist: had they been opened first, the message would be theirs."""
     arguments = [command, "-o", str(tmp_path)]
     if command != "demo":
@@ -280,9 +251,7 @@ def test_products_are_refused_before_any_work(
 
 
 @pytest.mark.parametrize("extra", [[], ["--overwrite"]], ids=["plain", "overwrite"])
-def test_an_output_that_is_a_file_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: list[str]
-) -> None:
+def test_an_output_that_is_a_file_is_refused(tmp_path, capsys, extra):
     path = tmp_path / "products"
     path.write_text("mine")
     assert main(["reduce", "nowhere.fits", "--opd", "nowhere.fits", "-o", str(path), *extra]) == 1
@@ -290,10 +259,7 @@ def test_an_output_that_is_a_file_is_refused(
     assert path.read_text() == "mine"
 
 
-# -- sequences -----------------------------------------------------------------------------------
-
-
-def calints_file(path: Path, star: str, reference: bool) -> Path:
+def calints_file(path, star, reference):
     rng = np.random.default_rng(1)
     data = rng.normal(10, 2, (2, 8, 10)).astype(np.float32)
     primary = fits.PrimaryHDU()
@@ -320,7 +286,7 @@ def calints_file(path: Path, star: str, reference: bool) -> Path:
 
 
 @pytest.fixture
-def frames(tmp_path: Path) -> Path:
+def frames(tmp_path):
     """A folder with frames of a target and of a reference star, and an empty file."""
     folder = tmp_path / "frames"
     folder.mkdir()
@@ -331,7 +297,7 @@ def frames(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def maps(tmp_path: Path) -> Path:
+def maps(tmp_path):
     """A folder of wavefront maps from before and after the frames."""
     folder = tmp_path / "maps"
     folder.mkdir()
@@ -340,9 +306,7 @@ def maps(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
-    tmp_path: Path, frames: Path, maps: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(tmp_path, frames, maps, capsys):
     products = tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products)]
     arguments += ["--dry-run", "--size", "8"]
@@ -379,14 +343,8 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
     ],
 )
 def test_a_dry_run_refuses_what_the_run_would_refuse(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-    options: list[str],
-    words: str,
-) -> None:
+    tmp_path, frames, maps, reduced, capsys, options, words
+):
     arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(tmp_path / "products")]
     arguments += ["--size", "8", *options]
     answers = []
@@ -401,13 +359,8 @@ def test_a_dry_run_refuses_what_the_run_would_refuse(
 
 
 def test_a_full_disk_is_noticed_before_the_work(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    tmp_path, frames, maps, reduced, capsys, monkeypatch
+):
     usage = SimpleNamespace(total=1e9, used=1e9 - 1e5, free=1e5)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(tmp_path / "products")]
@@ -417,12 +370,8 @@ def test_a_full_disk_is_noticed_before_the_work(
 
 
 def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    tmp_path, frames, maps, reduced, capsys
+):
     products = tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "--size", "8"]
     products.mkdir()
@@ -444,9 +393,7 @@ def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
     assert "--resume keeps products" in capsys.readouterr().err
 
 
-def test_frames_without_a_map_start_from_a_flat_wavefront(
-    tmp_path: Path, frames: Path, reduced: Reduced, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_without_a_map_start_from_a_flat_wavefront(tmp_path, frames, reduced, capsys):
     arguments = ["reduce", str(frames), "--opd", "flat", "-o", str(tmp_path / "products")]
     assert main([*arguments, "--size", "8"]) == 0
     assert "wavefront map: flat wavefront\n" in capsys.readouterr().out
@@ -454,8 +401,8 @@ def test_frames_without_a_map_start_from_a_flat_wavefront(
     assert not call.given.wavefront.data.any()
 
 
-def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
-    def steps(sequence: Sequence, **options: Any) -> dict[str, float]:
+def test_an_estimate_counts_the_fits_that_are_made(frames):
+    def steps(sequence, **options):
         return dict(steps_of(sequence, ReduceOptions(size=8, **options)))
 
     sequence = Sequence.from_files(frames).cutout(8)
@@ -487,9 +434,6 @@ def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
     assert quick["wavefront"] < both["wavefront"]
 
 
-# -- a reduction, with a stub in the place of the fit --------------------------------------------
-
-
 SUMMARY = {
     "sentence": "One companion.",
     "status": {
@@ -506,7 +450,7 @@ class StubReduction:
     progress: bool
     interrupted: bool
 
-    def write(self, folder: Path, **_: Any) -> list[Path]:
+    def write(self, folder, **_):
         folder.mkdir(exist_ok=True)
         path = folder / "summary.json"
         path.write_text(json.dumps(SUMMARY))
@@ -523,11 +467,11 @@ class Reduced(list[StubReduction]):
 
 
 @pytest.fixture
-def reduced(monkeypatch: pytest.MonkeyPatch) -> Reduced:
+def reduced(monkeypatch):
     """Stub for the fits and searches."""
     made = Reduced()
 
-    def stub(given: Preparation, *, progress: bool, products: Any) -> StubReduction:
+    def stub(given, *, progress, products):
         print("a library says hello")
         if isinstance(made.error, RefinementError):
             for _ in range(2):
@@ -542,12 +486,8 @@ def reduced(monkeypatch: pytest.MonkeyPatch) -> Reduced:
 
 
 def test_reduce_passes_its_options_on_and_names_the_products(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    tmp_path, frames, maps, reduced, capsys
+):
     products = tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd", str(maps), "--opd-date", "before"]
     arguments += ["-o", str(products), "--size", "8", "--threshold", "4", "--systematics", "off"]
@@ -567,9 +507,7 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     assert "1. products" in shown.err
 
 
-def test_overwriting_leaves_no_products_of_other_epochs(
-    tmp_path: Path, frames: Path, reduced: Reduced
-) -> None:
+def test_overwriting_leaves_no_products_of_other_epochs(tmp_path, frames, reduced):
     products = tmp_path / "products"
     for day in ("2022-01-02", "2022-07-30"):
         (products / day).mkdir(parents=True)
@@ -589,12 +527,7 @@ def test_overwriting_leaves_no_products_of_other_epochs(
     assert len(list(frames.iterdir())) == 3
 
 
-def test_a_spectrum_says_how_bright_the_star_is(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_spectrum_says_how_bright_the_star_is(tmp_path, frames, maps, capsys):
     spectrum = tmp_path / "star.txt"
     spectrum.write_text("2.0 0.4\n4.0 0.4\n6.0 0.4\n")
     arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(tmp_path / "products")]
@@ -608,13 +541,7 @@ def test_a_spectrum_says_how_bright_the_star_is(
     assert "both say how bright the star is" in capsys.readouterr().err
 
 
-def test_json_is_all_that_goes_to_standard_output(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_json_is_all_that_goes_to_standard_output(tmp_path, frames, maps, reduced, capsys):
     arguments = ["detect", str(frames / "one_calints.fits"), "--opd", str(maps / "x.fits")]
     arguments[-1] = str(maps / "opd_2022-07-31.fits")
     assert main([*arguments, "-o", str(tmp_path / "products"), "--size", "8", "--json"]) == 0
@@ -626,15 +553,9 @@ def test_json_is_all_that_goes_to_standard_output(
 
 @pytest.mark.parametrize("before", [True, False])
 def test_general_options_stand_before_or_after_the_command(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    before: bool,
-) -> None:
-    threads: list[int] = []
+    tmp_path, frames, maps, reduced, capsys, monkeypatch, before
+):
+    threads = []
     monkeypatch.setattr(torch, "set_num_threads", threads.append)
     log = tmp_path / "logs" / "run.log"
     general = ["-q", "--threads", "1", "--log-file", str(log)]
@@ -650,12 +571,7 @@ def test_general_options_stand_before_or_after_the_command(
     assert not any(getattr(h, "baseFilename", "") == str(log) for h in logging.root.handlers)
 
 
-def test_warnings_and_errors_are_messages(
-    tmp_path: Path,
-    frames: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_warnings_and_errors_are_messages(tmp_path, frames, reduced, capsys):
     old = opd_file(tmp_path / "opd_2020-01-01.fits")
     maps = tmp_path / "old"
     maps.mkdir()
@@ -676,14 +592,7 @@ def test_warnings_and_errors_are_messages(
     [MemoryError("8 GB"), RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 GB")],
     ids=["python", "torch"],
 )
-def test_too_little_memory_is_a_message(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    capsys: pytest.CaptureFixture[str],
-    reduced: Reduced,
-    error: Exception,
-) -> None:
+def test_too_little_memory_is_a_message(tmp_path, frames, maps, capsys, reduced, error):
     reduced.error = error
     arguments = ["detect", str(frames / "one_calints.fits"), "--opd", str(maps)]
     arguments += ["-o", str(tmp_path / "products"), "--size", "8"]
@@ -695,21 +604,13 @@ def test_too_little_memory_is_a_message(
         main(arguments)
 
 
-def test_impossible_arguments_are_messages(
-    tmp_path: Path, frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_impossible_arguments_are_messages(tmp_path, frames, capsys):
     products = ["-o", str(tmp_path / "products")]
     assert main(["detect", str(frames), "--opd", "nowhere.fits", *products]) == 1
     assert "is a folder, expected a file; the command reduce" in capsys.readouterr().err
 
 
-def test_an_interrupted_run_says_what_it_left(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_interrupted_run_says_what_it_left(tmp_path, frames, maps, reduced, capsys):
     products = tmp_path / "products"
     products.mkdir()
     (products / "notes.txt").write_text("mine")
@@ -725,16 +626,10 @@ def test_an_interrupted_run_says_what_it_left(
     assert capsys.readouterr().err.strip() == "pyklip-diffrender: interrupted; nothing was written"
 
 
-def test_mast_is_asked_for_the_map_of_the_date(
-    tmp_path: Path,
-    frames: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[tuple[str, str]] = []
+def test_mast_is_asked_for_the_map_of_the_date(tmp_path, frames, reduced, capsys, monkeypatch):
+    asked = []
 
-    def retrieve(date: Time, choice: str) -> OPDMap:
+    def retrieve(date, choice):
         asked.append((date.isot[:19], choice))
         if choice == "after":
             raise MissingOPDError("no wavefront map from MAST (no route to host)")
@@ -755,41 +650,26 @@ def test_mast_is_asked_for_the_map_of_the_date(
     ("path", "words"),
     [("nowhere/star.fits", "there is no folder"), (".", "is a folder, expected a file")],
 )
-def test_an_image_goes_into_a_folder_that_exists(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], path: str, words: str
-) -> None:
+def test_an_image_goes_into_a_folder_that_exists(tmp_path, capsys, path, words):
     assert main(["psf", "-o", str(tmp_path / path)]) == 1
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_without_permission_is_refused_before_the_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_without_permission_is_refused_before_the_work(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
     assert main(["demo", "-o", str(tmp_path / "products" / "deep")]) == 1
     assert f"no permission in {tmp_path}\n" in capsys.readouterr().err
 
 
-def test_a_device_that_is_not_there_is_an_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_device_that_is_not_there_is_an_error(tmp_path, capsys):
     path = tmp_path / "star.fits"
     assert main(["psf", "-o", str(path), "--device", "abacus"]) == 1
     assert "--device: PyTorch" in capsys.readouterr().err
     assert not path.exists()
 
 
-# -- configuration files -------------------------------------------------------------------------
-
-
-def test_a_written_configuration_gives_the_same_run(
-    tmp_path: Path,
-    frames: Path,
-    maps: Path,
-    reduced: Reduced,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_written_configuration_gives_the_same_run(tmp_path, frames, maps, reduced, capsys):
     config, products = tmp_path / "run.toml", tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "-q"]
     arguments += ["--size", "8", "--target", "HIP-1", "--star", "5.2,3.5"]
@@ -822,9 +702,7 @@ def test_a_written_configuration_gives_the_same_run(
         (None, "No such file"),
     ],
 )
-def test_a_wrong_configuration_is_a_usage_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str | None, words: str
-) -> None:
+def test_a_wrong_configuration_is_a_usage_error(tmp_path, capsys, content, words):
     config, star = tmp_path / "run.toml", tmp_path / "star.fits"
     if content is not None:
         config.write_text(content)
@@ -833,9 +711,7 @@ def test_a_wrong_configuration_is_a_usage_error(
     assert not star.exists()
 
 
-def test_checks_of_options_name_the_configuration_that_they_may_come_from(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_checks_of_options_name_the_configuration_that_they_may_come_from(tmp_path, capsys):
     config = tmp_path / "run.toml"
     config.write_text("[detect]\nthreshold = -3.0\n")
     arguments = ["detect", "x", "-o", "y", "--opd", "z"]
@@ -845,9 +721,7 @@ def test_checks_of_options_name_the_configuration_that_they_may_come_from(
     assert "taken from" not in capsys.readouterr().err
 
 
-def test_mistakes_of_a_survey_are_in_the_words_of_its_configuration(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_of_a_survey_are_in_the_words_of_its_configuration(tmp_path, capsys):
     config = tmp_path / "survey.toml"
     config.write_text("[options]\nsize = 2\n[[sequence]]\nfiles = '.'\nopd = 'flat'\n")
     assert main(["survey", str(config), "-o", str(tmp_path / "out")]) == 1
@@ -856,7 +730,7 @@ def test_mistakes_of_a_survey_are_in_the_words_of_its_configuration(
     assert "--size" not in shown
 
 
-def test_a_missing_map_is_answered_with_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_map_is_answered_with_what_there_is(capsys):
     for command in (
         ["detect", "x", "-o", "y"],
         ["reduce", "x", "-o", "y"],
@@ -870,16 +744,14 @@ def test_a_missing_map_is_answered_with_what_there_is(capsys: pytest.CaptureFixt
         assert "flat to start without one" in shown
 
 
-def test_tables_of_a_configuration_are_commands(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tables_of_a_configuration_are_commands(tmp_path, capsys):
     config = tmp_path / "run.toml"
     config.write_text("quiet = true\n[fit]\nsize = 20\n")
     assert main(["--config", str(config), "psf", "-o", str(tmp_path / "star.fits")]) == 2
     assert "[fit] is no command" in capsys.readouterr().err
 
 
-def test_the_documented_configuration_is_valid(tmp_path: Path) -> None:
+def test_the_documented_configuration_is_valid(tmp_path):
     page = (ROOT / "docs" / "reference" / "command_line.md").read_text(encoding="utf-8")
     example = page.partition("```toml\n")[2].partition("```")[0]
     assert '[reduce]\nframes = ["calints"]' in example
@@ -888,16 +760,15 @@ def test_the_documented_configuration_is_valid(tmp_path: Path) -> None:
     assert read_config(application, path)["reduce"]["log_file"] == "products/run.log"
 
 
-def test_the_rules_are_those_of_the_package() -> None:
+def test_the_rules_are_those_of_the_package():
     (option,) = (p for p in application.commands["reduce"].params if p.name == "opd_date")
     assert tuple(option.type.choices) == RULES
 
 
 @pytest.mark.parametrize(
-    ("words", "completed"),
-    [("--opd-", "plain,--opd-date"), ("--star-sed star", "file,star")],
+    ("words", "completed"), [("--opd-", "plain,--opd-date"), ("--star-sed star", "file,star")]
 )
-def test_the_shell_completes_options_and_files(words: str, completed: str) -> None:
+def test_the_shell_completes_options_and_files(words, completed):
     """What the shell's completion function calls."""
     done = subprocess.run(
         [sys.executable, "-m", "pyklip_diffrender.cli"],
@@ -915,13 +786,8 @@ def test_the_shell_completes_options_and_files(words: str, completed: str) -> No
     assert done.stdout.splitlines() == [completed], done.stderr
 
 
-# -- doctor --------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
-def test_doctor_reports_versions_data_machine_and_a_fit(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_doctor_reports_versions_data_machine_and_a_fit(monkeypatch, capsys):
     monkeypatch.delenv("STPSF_PATH", raising=False)
     status = main(["doctor"])
     lines = capsys.readouterr().out.splitlines()
@@ -933,7 +799,7 @@ def test_doctor_reports_versions_data_machine_and_a_fit(
     assert any(line.startswith("ok    self-test in") for line in lines)
 
 
-def test_doctor_fails_with_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_fails_with_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setenv("STPSF_PATH", str(tmp_path))
     for checks, words in (
         (doctor.check_libraries(["torchh"]), "torchh cannot be imported"),
@@ -950,7 +816,7 @@ def test_doctor_fails_with_a_sentence(tmp_path: Path, monkeypatch: pytest.Monkey
     assert doctor.memory_check(None).state == "note"
 
 
-def test_the_plan_says_what_reading_a_large_file_takes(tmp_path: Path) -> None:
+def test_the_plan_says_what_reading_a_large_file_takes(tmp_path):
     path = calints(tmp_path / "a_calints.fits")
     sequence = Sequence.from_files([path])
     usual = describe_plan(sequence, ReduceOptions())

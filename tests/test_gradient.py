@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.refinement.forward import Problem, State
+from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.refinement.solver import (
     ModelDerivatives,
     Solver,
@@ -33,7 +29,7 @@ FREE = ("star_offset", "lyot_shift", "lyot_rotation", "blur", "flux", "backgroun
 SCALES = {"segment": 20.0, "texture": 20.0}
 
 
-def solver_of(frames: int, **changes: object) -> tuple[Solver, State]:
+def solver_of(frames, **changes):
     """A solver and a state away from the solution, for frames in three wavelengths.
 
     All frames show the same pixels, with a pattern of which little is known.
@@ -70,7 +66,7 @@ def solver_of(frames: int, **changes: object) -> tuple[Solver, State]:
     return solver, solver.objective.at(unknowns, vector + 0.1 * moves * moved)
 
 
-def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
+def gradient(solver, state, *, exact):
     """Minus half the derivative of chi-squared."""
     if exact:
         weights = solver.objective.errors(state, 0.01, 4.0)
@@ -79,15 +75,13 @@ def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
     return equations.gradient - equations.curvature @ equations.current
 
 
-def linear_model(
-    solver: Solver, state: State, kappa: float, robust: float = math.inf, *, final: bool = True
-) -> LinearModel:
+def linear_model(solver, state, kappa, robust=math.inf, *, final=True):
     """Of all modes, with the priors of the solver's settings."""
     priors = solver.priors_of(solver.settings)
     return solver.linear_model(state, priors, kappa, len(BASIS), robust, final=final)
 
 
-def slope_along(solver: Solver, state: State, direction: Tensor, step: float = 1e-4) -> float:
+def slope_along(solver, state, direction, step=1e-4):
     """Minus half the derivative of chi-squared along a direction, by differences."""
     weights = solver.objective.errors(state, 0.01, 4.0)
     ahead, behind = (
@@ -99,13 +93,13 @@ def slope_along(solver: Solver, state: State, direction: Tensor, step: float = 1
     return -(ahead - behind) / (4 * step)
 
 
-def units(solver: Solver, state: State) -> Tensor:
+def units(solver, state):
     """Prior deviations of the unknowns, and values of those without one."""
     unit = solver.prior_deviation(state.unknowns, solver.priors_of(solver.settings))
     return torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
 
 
-def slopes_by_name(solver: Solver, state: State) -> Iterator[tuple[str, Tensor, float]]:
+def slopes_by_name(solver, state):
     """A random direction within each group of unknowns, and the slope along it by differences."""
     names = [unknown.name for unknown in state.unknowns.labels()]
     assert {*FREE, "amplitude", "modes"} <= set(names)
@@ -117,7 +111,7 @@ def slopes_by_name(solver: Solver, state: State) -> Iterator[tuple[str, Tensor, 
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
+def test_the_gradient_is_that_of_chi_squared(frames):
     """Against differences of chi-squared, which have an error of 1e-7 of it in these steps."""
     solver, state = solver_of(frames)
     assert solver.objective.shares_pattern == (frames > 1,) * frames
@@ -129,7 +123,7 @@ def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
             assert abs(float(coarse @ direction) - slope) > 1e-2 * abs(slope)
 
 
-def of_the_model_itself(solver: Solver) -> Solver:
+def of_the_model_itself(solver):
     """A solver whose coarse copy is the model."""
     return Solver(
         [forward.problem for forward in solver.objective.forwards],
@@ -140,7 +134,7 @@ def of_the_model_itself(solver: Solver) -> Solver:
 
 
 @pytest.mark.parametrize("contrast", [3e-4, 0.05])
-def test_the_gradient_by_companions_is_that_of_chi_squared(contrast: float) -> None:
+def test_the_gradient_by_companions_is_that_of_chi_squared(contrast):
     """Their images are those of the coarse copy, which is the model in this test."""
     solver, state = solver_of(2)
     solver = of_the_model_itself(solver)
@@ -156,7 +150,7 @@ def test_the_gradient_by_companions_is_that_of_chi_squared(contrast: float) -> N
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames: int) -> None:
+def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames):
     """It outshines the star. Neglected, the gradient would be wrong by more than its size."""
     solver, state = solver_of(frames)
     solver = of_the_model_itself(solver)
@@ -169,7 +163,7 @@ def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames: int) ->
             np.testing.assert_allclose(float(each @ direction), slope, rtol=2e-3, err_msg=name)
 
 
-def test_the_exact_gradient_has_the_light_of_all_companions() -> None:
+def test_the_exact_gradient_has_the_light_of_all_companions():
     """The Jacobian has that of the brightest only, so the minimum must not depend on it."""
     solver, state = solver_of(1)
     solver = of_the_model_itself(solver)
@@ -183,7 +177,7 @@ def test_the_exact_gradient_has_the_light_of_all_companions() -> None:
     assert max(errors) > 0.02
 
 
-def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
+def test_where_the_copy_is_the_model_both_gradients_are_the_same():
     """But for single precision, in which the derivatives of the copy are stored."""
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
@@ -194,7 +188,7 @@ def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> None:
+def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames):
     """Against the equations of a copy that is the model; those of a coarse one are far from it."""
     solver, state = solver_of(frames)
     assert solver.objective.shares_pattern == (frames > 1,) * frames
@@ -214,7 +208,7 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     assert (products[0] - expected).norm() > 0.1 * expected.norm()
 
 
-def test_the_light_of_a_faint_companion_is_linear_in_the_curvature() -> None:
+def test_the_light_of_a_faint_companion_is_linear_in_the_curvature():
     """As in the Jacobian: it depends on contrast, position and flux, and not on the wavefront."""
     solver, state = solver_of(2)
     solver = of_the_model_itself(solver)
@@ -233,7 +227,7 @@ def test_the_light_of_a_faint_companion_is_linear_in_the_curvature() -> None:
         assert (product - expected).norm() < 2e-3 * expected.norm()
 
 
-def test_the_light_of_a_faint_companion_follows_the_flux() -> None:
+def test_the_light_of_a_faint_companion_follows_the_flux():
     """Beside the star it hardly shows in products of the whole curvature."""
     solver, state = solver_of(1)
     companion = dr.Planet(9e-5, 0.5, 20.0)
@@ -251,7 +245,7 @@ def test_the_light_of_a_faint_companion_follows_the_flux() -> None:
     )
 
 
-def test_a_companion_that_the_model_error_outweighs_counts_in_the_last_derivatives_only() -> None:
+def test_a_companion_that_the_model_error_outweighs_counts_in_the_last_derivatives_only():
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True)
     companion = dr.Planet(0.01, 0.5, 20.0)
     state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
@@ -266,7 +260,7 @@ def test_a_companion_that_the_model_error_outweighs_counts_in_the_last_derivativ
 
 
 @pytest.mark.slow
-def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
+def test_an_accurate_step_ends_where_that_of_the_model_does():
     """In as many iterations as are needed, whatever the coarse copy that preconditions them."""
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
@@ -303,7 +297,7 @@ def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 3])
-def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong: int) -> None:
+def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong):
     """Of that many directions the preconditioner says far too little; two more iterations end."""
     rng = np.random.default_rng(8)
     vectors = torch.from_numpy(np.linalg.qr(rng.normal(size=(20, 20)))[0])
@@ -312,7 +306,7 @@ def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong: i
     stated[:wrong] /= 10.0 ** (2 + torch.arange(wrong))
     products = []
 
-    def product(x: Tensor) -> Tensor:
+    def product(x):
         products.append(x)
         return vectors @ (powers * (vectors.T @ x))
 
@@ -330,7 +324,7 @@ def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong: i
     assert len(products) <= wrong + 2
 
 
-def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner() -> None:
+def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner():
     """And end without a step where there is nothing to gain."""
     rng = np.random.default_rng(9)
     matrix = torch.from_numpy(rng.normal(size=(30, 30)))
@@ -345,7 +339,7 @@ def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner(
     assert not x.any()
 
 
-def test_conjugate_gradients_do_not_end_by_what_the_preconditioner_expects() -> None:
+def test_conjugate_gradients_do_not_end_by_what_the_preconditioner_expects():
     """It expects a decrease of 1 where there is one of 100, of which 5 would matter."""
     gradient = torch.tensor([10.0])
     x, settled = conjugate_gradients(lambda x: x, lambda x: x / 100, gradient, enough=5.0)
@@ -353,7 +347,7 @@ def test_conjugate_gradients_do_not_end_by_what_the_preconditioner_expects() -> 
     torch.testing.assert_close(x, gradient)
 
 
-def test_accurate_steps_keep_their_equations() -> None:
+def test_accurate_steps_keep_their_equations():
     """Until conjugate gradients need more iterations than there are, and until a companion."""
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
     # Of the model itself: one iteration is enough with equations of nearly the same state.
@@ -362,7 +356,7 @@ def test_accurate_steps_keep_their_equations() -> None:
     carried = StepState(solver.priors_of(solver.settings))
     before = solver._cost(state, weights, carried.priors)
 
-    def replaces(state: State, kappa: float) -> bool:
+    def replaces(state, kappa):
         """Whether a step from a state makes new equations."""
         equations = solver.equations.last
         solver._accurate_step(state, carried, kappa, len(BASIS))
@@ -382,14 +376,14 @@ def test_accurate_steps_keep_their_equations() -> None:
     assert replaces(grown, 0.002)
 
 
-def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equations_that_lead_nowhere_are_replaced(monkeypatch):
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
     solver = of_the_model_itself(solver)
     carried = StepState(solver.priors_of(solver.settings))
     after = solver._accurate_step(state, carried, 0.01, len(BASIS)).state
     earlier, right = solver.equations.last, accurate_step
 
-    def wrong(*arguments: Any, **options: Any) -> tuple[Tensor, bool]:
+    def wrong(*arguments, **options):
         step, settled = right(*arguments, **options)
         return (-step if solver.equations.last is earlier else step), settled
 
@@ -400,7 +394,7 @@ def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("accurate", [False, True])
-def test_a_step_depends_on_its_arguments_alone(accurate: bool) -> None:
+def test_a_step_depends_on_its_arguments_alone(accurate):
     """Not on the steps before it: what these hand on is an argument."""
     solver, state = solver_of(1, relinearise=1e-9, accurate_steps=accurate)
     first = StepState(solver.priors_of(solver.settings), damping=0.3, kappa=0.1)
@@ -420,7 +414,7 @@ def test_a_step_depends_on_its_arguments_alone(accurate: bool) -> None:
     )
 
 
-def test_other_weights_need_no_new_jacobian() -> None:
+def test_other_weights_need_no_new_jacobian():
     """Neither for the errors of all pixels nor where a pixel is left out; the model is the same."""
     models = []
     for goes_on in (True, False):
@@ -441,7 +435,7 @@ def test_other_weights_need_no_new_jacobian() -> None:
     assert models[2].frames[0].weight[7, 9] == 0
 
 
-def test_derivatives_by_a_frame_become_those_by_all_unknowns() -> None:
+def test_derivatives_by_a_frame_become_those_by_all_unknowns():
     """The adjoint of `of_unknowns`, with modes that drift between the frames."""
     solver, state = solver_of(2, drift=WavefrontPrior(SCALES, fit_scales=False))
     assert solver.priors_of(solver.settings).drift > 0

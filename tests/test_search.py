@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 from pyklip_diffrender.detection import Candidates, search
@@ -22,7 +20,7 @@ FITTED = {(10, 20): 8.0, (30, 12): 4.0, (25, 33): 6.0}
 class MadeUpMaps:
     """A map with unit information; a candidate takes its own peak away."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         y, x = np.indices((41, 41)) - 20.0
         self.grid = 0.06 * np.stack([x, y], axis=-1)
         self.groups = ()
@@ -30,7 +28,7 @@ class MadeUpMaps:
         self.starlight = np.ones((41, 41))
         self.correlation = np.pad([[1.0]], 2)
 
-    def without(self, candidates: Candidates) -> np.ndarray:
+    def without(self, candidates):
         snr = np.zeros((41, 41))
         for pixel, height in PEAKS.items():
             away = candidates.offsets.numpy() - self.grid[pixel]
@@ -38,14 +36,14 @@ class MadeUpMaps:
                 snr[pixel] = height
         return snr
 
-    def snr(self, numerator: np.ndarray) -> np.ndarray:
+    def snr(self, numerator):
         return numerator
 
 
-def test_a_dismissed_peak_is_not_taken_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dismissed_peak_is_not_taken_again(monkeypatch):
     maps, fitted = MadeUpMaps(), []
 
-    def refine(groups: Any, candidates: Candidates, reach: float, *_: int) -> Candidates:
+    def refine(groups, candidates, reach, *_):
         fitted.append(len(candidates))
         away = [
             np.hypot(*(candidates.offsets.numpy() - maps.grid[pixel]).T).reshape(-1)

@@ -10,7 +10,7 @@ from benchmarks.speed.setting import Setting
 from benchmarks.speed_error import TITLES, Point, as_table, draw
 
 
-def test_a_figure_has_a_panel_for_each_task_and_a_line_for_each_way() -> None:
+def test_a_figure_has_a_panel_for_each_task_and_a_line_for_each_way():
     points = [
         Point(what, way, f"{k}", 10.0**k, 10.0**-k)
         for what in ("image", "gradient", "fit", "reduction")
@@ -28,7 +28,7 @@ def test_a_figure_has_a_panel_for_each_task_and_a_line_for_each_way() -> None:
 
 
 @pytest.mark.slow
-def test_small_measurements_are_less_wrong_with_more_samples() -> None:
+def test_small_measurements_are_less_wrong_with_more_samples():
     setting = Setting(quick=True)
     images = speed_error.image_points(setting, 0.01)
     gradients = speed_error.gradient_points(setting, 0.01)

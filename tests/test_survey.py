@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from concurrent.futures import CancelledError
 from dataclasses import replace
 from datetime import date
@@ -31,27 +30,15 @@ from benchmarks.calints_files import CENTER, SIDE, calints
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.detection import Candidates, with_planets
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.errors import (
-    CorruptFileError,
-    IncompatibleSetupError,
-    RefinementError,
-)
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, RefinementError
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.refinement import FrameFit, GaussNewton
-from pyklip_diffrender.surveys import (
-    execution,
-    survey_page,
-)
-from pyklip_diffrender.surveys import (
-    execution as work,
-)
-from pyklip_diffrender.surveys import (
-    jobs as folders,
-)
+from pyklip_diffrender.surveys import execution, survey_page
+from pyklip_diffrender.surveys import execution as work
+from pyklip_diffrender.surveys import jobs as folders
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
-from pyklip_diffrender.surveys.execution import Work
-from pyklip_diffrender.surveys.jobs import Injection, Job, jobs_of
+from pyklip_diffrender.surveys.jobs import Injection, jobs_of
 from pyklip_diffrender.surveys.survey_page import COLUMNS, table_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,36 +49,33 @@ PLANETS = {"contrasts": [1e-5, 3e-6], "separations": [0.5, 1.0], "angles": [0, 9
 
 
 @pytest.fixture
-def _drawn() -> None:
+def _drawn():
     """For tests that need the picture of the page, which takes a second."""
 
 
 @pytest.fixture(autouse=True)
-def _not_drawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def _not_drawn(request, monkeypatch):
     if "_drawn" not in request.fixturenames:
         monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"no picture")
 
 
-def planned(config: dict[str, Any]) -> list[Job]:
+def planned(config):
     return jobs_of(read_config(config))
 
 
-def hidden(output: Path) -> list[str]:
+def hidden(output):
     """What is left of jobs that never ended."""
     return [path.name for path in (output / "jobs").iterdir() if path.name.startswith(".")]
 
 
-# -- configuration ---------------------------------------------------------------------------------
-
-
-def test_a_file_says_the_same_as_a_mapping(tmp_path: Path) -> None:
+def test_a_file_says_the_same_as_a_mapping(tmp_path):
     config = inputs(tmp_path)
     path = configuration(tmp_path / "survey.toml", config)
     assert read_config(path) == read_config(config)
     assert [job.key for job in planned(config)] == [job.key for job in jobs_of(read_config(path))]
 
 
-def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
     inputs(tmp_path / "data", 1)
     path = tmp_path / "data" / "survey.toml"
     path.write_text('[[sequence]]\nfiles = "star0_calints.fits"\nopd = "opd.fits"\n')
@@ -101,7 +85,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
     assert sequence.name == "star0_calints"
 
 
-def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
+def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
     config = inputs(tmp_path, 2)
     config["options"] = {"threshold": 6, "size": 48, "settings": {"cycles": 8, "robust": inf}}
     config["injections"] = PLANETS
@@ -115,7 +99,7 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
     assert set(run_survey(config, tmp_path / "out", stub)["status"]) == {"finished"}
 
 
-def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path: Path) -> None:
+def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path):
     config = inputs(tmp_path, 1)
     plain = config["sequence"][0]
     config["sequence"] += [{**plain, "name": n, n: True} for n in ("wide", "disk", "completeness")]
@@ -163,9 +147,7 @@ def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path:
         ((1,), "code", "import os", ["sequence 2: got the key 'code'", "one of files"]),
     ],
 )  # fmt: skip
-def test_a_mistake_is_named_before_anything_is_done(
-    tmp_path: Path, where: tuple[int, ...], key: str, value: Any, words: list[str]
-) -> None:
+def test_a_mistake_is_named_before_anything_is_done(tmp_path, where, key, value, words):
     config = inputs(tmp_path / "data", 2)
     place = config["sequence"][where[0]] if where else config
     place[key] = value
@@ -178,7 +160,7 @@ def test_a_mistake_is_named_before_anything_is_done(
     assert not (tmp_path / "out").exists()
 
 
-def test_all_mistakes_are_named_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_are_named_at_once(tmp_path):
     config = {"workers": "two", "sequence": [{"files": []}, 3, {"opd": "x", "size": 1}]}
     with pytest.raises(IncompatibleSetupError) as raised:
         read_config(config)
@@ -194,7 +176,7 @@ def test_all_mistakes_are_named_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"a = [", b"\xff", b"[" * 5000, b"a = 1\na = 2"])
-def test_a_file_that_is_not_toml(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_not_toml(tmp_path, content):
     path = tmp_path / "survey.toml"
     with pytest.raises(CorruptFileError, match=r"survey\.toml: cannot be read"):
         read_config(path)
@@ -203,14 +185,14 @@ def test_a_file_that_is_not_toml(tmp_path: Path, content: bytes) -> None:
         read_config(path)
 
 
-def test_the_same_job_twice_is_a_mistake(tmp_path: Path) -> None:
+def test_the_same_job_twice_is_a_mistake(tmp_path):
     config = inputs(tmp_path, 1)
     config["sequence"].append({**config["sequence"][0], "name": "again"})
     with pytest.raises(IncompatibleSetupError, match="again: got the same inputs and options"):
         planned(config)
 
 
-def calints_file(path: Path, star: str, day: str | None, *, reference: bool = False) -> None:
+def calints_file(path, star, day, *, reference=False):
     primary = fits.PrimaryHDU()
     primary.header.update({"FILTER": "F444W", "TARGPROP": star, "IS_PSF": reference})
     if day is not None:
@@ -225,7 +207,7 @@ def calints_file(path: Path, star: str, day: str | None, *, reference: bool = Fa
     fits.HDUList(hdus).writeto(path, overwrite=True)
 
 
-def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path: Path) -> None:
+def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path):
     config = inputs(tmp_path, 1)
     maps = tmp_path / "maps"
     maps.mkdir()
@@ -250,7 +232,7 @@ def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path: Path) -
     assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
 
 
-def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path: Path) -> None:
+def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path):
     config = inputs(tmp_path, 1)
     frames = tmp_path / "frames"
     for k, day in enumerate(("2022-10-03", "2022-10-04", "2023-12-01")):
@@ -274,7 +256,7 @@ def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path: Path) -> None:
     assert [each.name for each in planned(config)] == ["HD 1", "HD 1"]
 
 
-def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sequence_may_have_no_map(tmp_path, monkeypatch):
     (tmp_path / "flat").mkdir()
     monkeypatch.chdir(tmp_path)
     config = inputs(tmp_path, 1)
@@ -286,10 +268,7 @@ def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert job.key != mapped.key
 
 
-# -- names of jobs ---------------------------------------------------------------------------------
-
-
-def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path: Path) -> None:
+def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path):
     config, output = inputs(tmp_path / "a", 1), tmp_path / "out"
     config["sequence"][0] |= {"name": "β Pic, F444W"}
     config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
@@ -301,7 +280,7 @@ def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path: Path) -
     assert jobs[1].base_folder == jobs[0].folder
     ran = []
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         ran.append(job.folder)
         return stub(job, folder)
 
@@ -316,7 +295,7 @@ def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path: Path) -
     assert f'"jobs/{names[0]}/report.html"' in page
 
 
-def test_tables_have_units_and_descriptions(tmp_path: Path) -> None:
+def test_tables_have_units_and_descriptions(tmp_path):
     run_survey(inputs(tmp_path / "a", 1), tmp_path / "out", stub)
     table = Table.read(tmp_path / "out/results.ecsv")
     for name in ("separation_arcsec", "injected_separation_arcsec"):
@@ -328,7 +307,7 @@ def test_tables_have_units_and_descriptions(tmp_path: Path) -> None:
     assert "0.5 arcsec" in table["limit_0.5_arcsec"].description
 
 
-def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path: Path) -> None:
+def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path):
     config = inputs(tmp_path / "a", 1)
     (job,) = planned(config)
     moved = inputs(tmp_path / "b", 1)
@@ -341,7 +320,7 @@ def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path: Path
     assert [each.key for each in planned(config)] != [job.key]
 
 
-def test_a_new_version_is_a_new_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_version_is_a_new_job(tmp_path, monkeypatch):
     config = inputs(tmp_path, 1)
     (old,) = planned(config)
     monkeypatch.setattr("pyklip_diffrender.surveys.jobs.__version__", "99.0")
@@ -349,13 +328,10 @@ def test_a_new_version_is_a_new_job(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert new.key != old.key
 
 
-# -- running ---------------------------------------------------------------------------------------
-
-
-def test_finished_jobs_are_not_run_again(tmp_path: Path) -> None:
+def test_finished_jobs_are_not_run_again(tmp_path):
     config, output, ran = inputs(tmp_path / "data"), tmp_path / "out", []
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         ran.append(job.name)
         return stub(job, folder)
 
@@ -374,11 +350,11 @@ def test_finished_jobs_are_not_run_again(tmp_path: Path) -> None:
     assert hidden(output) == []
 
 
-def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
+def test_a_failure_is_a_row_and_is_tried_again(tmp_path):
     config, output = inputs(tmp_path / "data"), tmp_path / "out"
     config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         (folder / "half").write_text("a product")
         if job.name.startswith("star1"):
             raise ZeroDivisionError("at the second star")
@@ -402,11 +378,11 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
     assert hidden(output) == []
 
 
-def test_an_injection_starts_from_the_finished_reduction(tmp_path: Path) -> None:
+def test_an_injection_starts_from_the_finished_reduction(tmp_path):
     config = inputs(tmp_path / "data", 1)
     config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         if job.injection:
             assert (folder.parent / str(job.base_folder) / "report.html").exists()
         return stub(job, folder)
@@ -418,25 +394,24 @@ def test_an_injection_starts_from_the_finished_reduction(tmp_path: Path) -> None
     assert table["recovered"].tolist() == [None, True]
 
 
-def test_what_another_survey_published_meanwhile_stays(tmp_path: Path) -> None:
+def test_what_another_survey_published_meanwhile_stays(tmp_path):
     (job,) = planned(inputs(tmp_path / "data", 1))
     jobs = folders.prepare(tmp_path / "out")
     # In a folder of the same name, because its inputs are the same.
     rival = replace(job, opd="rival")
 
-    def work(inner: Job, folder: Path) -> dict[str, Any]:
+    def work(inner, folder):
         if inner.opd != "rival":
             assert execution.run_job(rival, jobs, work)["status"] == "finished"
         return stub(inner, folder)
 
     assert execution.run_job(job, jobs, work)["status"] == "finished"
     record = folders.read_record(jobs / job.folder)
-    assert record is not None
     assert record["job"]["opd"] == "rival"
     assert hidden(tmp_path / "out") == []
 
 
-def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
+def test_only_what_dead_processes_left_is_removed(tmp_path):
     jobs = folders.prepare(tmp_path)
     with subprocess.Popen([sys.executable, "-c", ""]) as dead:
         pass
@@ -452,9 +427,7 @@ def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
     assert sorted(jobs.iterdir()) == sorted([mine, elsewhere])
 
 
-def test_containers_with_one_host_name_leave_each_other_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_containers_with_one_host_name_leave_each_other_alone(tmp_path, monkeypatch):
     """The first process of another container has a number that means nothing here."""
     jobs = folders.prepare(tmp_path)
     here = os.stat
@@ -474,10 +447,10 @@ def test_containers_with_one_host_name_leave_each_other_alone(
     assert list(jobs.iterdir()) == [foreign]
 
 
-def test_a_message_in_another_encoding_stops_nothing(tmp_path: Path) -> None:
+def test_a_message_in_another_encoding_stops_nothing(tmp_path):
     config, output = inputs(tmp_path / "data", 2), tmp_path / "out"
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         if job.name.startswith("star1"):
             # As Python quotes a Latin-1 name of a file.
             raise ValueError("no such file: " + os.fsdecode(b"caf\xe9.fits"))
@@ -493,7 +466,7 @@ def test_a_message_in_another_encoding_stops_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])
-def test_a_damaged_record_is_a_missing_job(tmp_path: Path, damage: str) -> None:
+def test_a_damaged_record_is_a_missing_job(tmp_path, damage):
     config, output = inputs(tmp_path / "data", 1), tmp_path / "out"
     (name,) = run_survey(config, output, stub)["folder"]
     record = output / "jobs" / name / "job.json"
@@ -503,10 +476,10 @@ def test_a_damaged_record_is_a_missing_job(tmp_path: Path, damage: str) -> None:
     assert json.loads(record.read_text())["products"] == whole["products"]
 
 
-def test_frames_that_change_on_the_way_are_noticed(tmp_path: Path) -> None:
+def test_frames_that_change_on_the_way_are_noticed(tmp_path):
     config = inputs(tmp_path / "data", 2)
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         Path(config["sequence"][1]["files"]).write_bytes(b"other")
         return stub(job, folder)
 
@@ -516,7 +489,7 @@ def test_frames_that_change_on_the_way_are_noticed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["file", "version", "output"])
-def test_a_worker_that_sees_something_else_says_so(tmp_path: Path, what: str) -> None:
+def test_a_worker_that_sees_something_else_says_so(tmp_path, what):
     (job,) = planned(inputs(tmp_path / "data", 1))
     jobs = folders.prepare(tmp_path / "out")
     words = {"file": "does not see this file", "version": "99.0", "output": "see this folder"}
@@ -533,10 +506,7 @@ def test_a_worker_that_sees_something_else_says_so(tmp_path: Path, what: str) ->
     assert jobs.exists() == (what != "output")
 
 
-# -- results ---------------------------------------------------------------------------------------
-
-
-def test_the_tables_say_the_same(tmp_path: Path) -> None:
+def test_the_tables_say_the_same(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     config = inputs(tmp_path / "data", 2)
     config["sequence"][0]["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
@@ -556,10 +526,10 @@ def test_the_tables_say_the_same(tmp_path: Path) -> None:
     assert rows[0]["peak_memory_bytes"] > 1e6
 
 
-def test_the_tables_are_there_while_the_survey_runs(tmp_path: Path) -> None:
+def test_the_tables_are_there_while_the_survey_runs(tmp_path):
     config, output, seen = inputs(tmp_path / "data"), tmp_path / "out", []
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         path = output / "results.ecsv"
         seen.append(list(Table.read(path)["status"]) if path.exists() else [])
         return stub(job, folder)
@@ -570,23 +540,23 @@ def test_the_tables_are_there_while_the_survey_runs(tmp_path: Path) -> None:
 
 
 class Tags(HTMLParser):
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
 
 
 @pytest.mark.usefixtures("_drawn")
-def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path: Path) -> None:
+def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path):
     config = inputs(tmp_path / "data", 2)
     config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
     for k, name in enumerate((HOSTILE, "$\\frac{_a$")):
         config["sequence"][k]["name"] = name
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         if job.name == HOSTILE and job.injection:
             raise ValueError(HOSTILE)
         return {**stub(job, folder), **result(HOSTILE), "filter": HOSTILE, "fit_status": HOSTILE}
@@ -606,7 +576,7 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path: Path) ->
 
 
 @pytest.mark.usefixtures("_drawn")
-def test_a_survey_of_many_stars_has_one_picture(tmp_path: Path) -> None:
+def test_a_survey_of_many_stars_has_one_picture(tmp_path):
     (job,) = planned(inputs(tmp_path / "data", 1))
     record = {"status": "finished", "result": result(), "seconds": 1.0}
     rows = [(replace(job, name=f"star {k}"), record) for k in range(12)]
@@ -615,10 +585,7 @@ def test_a_survey_of_many_stars_has_one_picture(tmp_path: Path) -> None:
     assert "12 sequences reduced, 12 companion candidates in 12 of them." in text
 
 
-# -- where it runs ---------------------------------------------------------------------------------
-
-
-def test_the_table_shows_its_contrasts_on_80_columns() -> None:
+def test_the_table_shows_its_contrasts_on_80_columns():
     values = {"name": "HIP-65426_F444W", "status": "finished", "contrast": 3.6276222428e-4,
               "snr": 70.0387387, "message": "none", "key": "0123456789abcdef"}  # fmt: skip
     shown = table_of([dict.fromkeys(COLUMNS) | values]).pformat(max_width=80)
@@ -627,7 +594,7 @@ def test_the_table_shows_its_contrasts_on_80_columns() -> None:
 
 
 @pytest.mark.parametrize("missing", ["dask", "pyarrow"])
-def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+def test_without_the_extra(tmp_path, monkeypatch, missing):
     config = inputs(tmp_path / "data", 1)
     for name in [each for each in sys.modules if each.split(".")[0] == missing]:
         monkeypatch.setitem(sys.modules, name, None)
@@ -644,16 +611,14 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, miss
     assert (tmp_path / "out" / "results.parquet").exists() == (missing != "pyarrow")
 
 
-def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
+def test_an_output_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "out").write_text("mine")
     with pytest.raises(IncompatibleSetupError, match=r"output: got .*out, expected a folder"):
         run_survey(inputs(tmp_path / "data", 1), tmp_path / "out", stub)
     assert (tmp_path / "out").read_text() == "mine"
 
 
-def test_a_table_that_cannot_be_written_stops_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_table_that_cannot_be_written_stops_nothing(tmp_path, caplog):
     config, output = inputs(tmp_path / "data"), tmp_path / "out"
     (output / "results.ecsv").mkdir(parents=True)
     with pytest.raises(IncompatibleSetupError, match="Is a directory"):
@@ -663,12 +628,12 @@ def test_a_table_that_cannot_be_written_stops_nothing(
     assert list(run_survey(config, output, pytest.fail)["status"]) == ["finished"] * 3
 
 
-def test_a_job_that_another_disk_has_is_a_failure(tmp_path: Path) -> None:
+def test_a_job_that_another_disk_has_is_a_failure(tmp_path):
     (job,) = planned(inputs(tmp_path / "data", 1))
     jobs = folders.prepare(tmp_path / "out")
 
     class Future:
-        def result(self) -> dict[str, Any]:
+        def result(self):
             return {"status": "finished", "host": "node7"}
 
     record = execution._record_of(Future(), job, jobs, patience=0)
@@ -676,12 +641,12 @@ def test_a_job_that_another_disk_has_is_a_failure(tmp_path: Path) -> None:
     assert "node7 wrote its products to another disk" in record["message"]
 
 
-def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path: Path) -> None:
+def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path):
     (job,) = planned(inputs(tmp_path / "data", 1))
     jobs = folders.prepare(tmp_path / "out")
 
     class Future:
-        def result(self) -> dict[str, Any]:
+        def result(self):
             raise CancelledError
 
     with pytest.raises(RefinementError, match="scheduler was lost"):
@@ -691,19 +656,14 @@ def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path: Path
 
 
 @pytest.fixture
-def do(monkeypatch: pytest.MonkeyPatch) -> Callable[[Work], None]:
+def do(monkeypatch):
     """Give the command other work than reductions."""
     return partial(monkeypatch.setattr, "pyklip_diffrender.surveys.execution.reduce_job")
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_the_command_says_what_came_of_it(
-    tmp_path: Path,
-    do: Callable[[Work], None],
-    capsys: pytest.CaptureFixture[str],
-    broken: bool,
-) -> None:
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+def test_the_command_says_what_came_of_it(tmp_path, do, capsys, broken):
+    def work(job, folder):
         if broken and job.name.startswith("star1"):
             raise ValueError("no such star")
         return stub(job, folder)
@@ -723,10 +683,8 @@ def test_the_command_says_what_came_of_it(
     assert f"wrote {output / 'survey.html'}" in said
 
 
-def test_an_interrupted_command_says_that_it_can_go_on(
-    tmp_path: Path, do: Callable[[Work], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+def test_an_interrupted_command_says_that_it_can_go_on(tmp_path, do, capsys):
+    def work(job, folder):
         if job.name.startswith("star1"):
             raise KeyboardInterrupt
         return stub(job, folder)
@@ -740,12 +698,10 @@ def test_an_interrupted_command_says_that_it_can_go_on(
     assert list(table["status"]) == ["finished", "waiting", "waiting"]
 
 
-def test_jobs_aim_at_less_than_the_memory_of_their_worker(
-    tmp_path: Path, do: Callable[[Work], None]
-) -> None:
+def test_jobs_aim_at_less_than_the_memory_of_their_worker(tmp_path, do):
     limits = []
 
-    def work(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
+    def work(job, folder, memory=None):
         limits.append(memory)
         return stub(job, folder)
 
@@ -756,9 +712,7 @@ def test_jobs_aim_at_less_than_the_memory_of_their_worker(
     assert limits == [3.2e9, None]
 
 
-def test_a_configuration_with_mistakes_is_an_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_configuration_with_mistakes_is_an_error(tmp_path, capsys):
     path = tmp_path / "survey.toml"
     path.write_text("workers = -1")
     assert main(["survey", str(path), "-o", str(tmp_path / "out")]) == 1
@@ -767,16 +721,14 @@ def test_a_configuration_with_mistakes_is_an_error(
     assert not (tmp_path / "out").exists()
 
 
-def test_public_name() -> None:
+def test_public_name():
     assert dr.survey is survey
 
-
-# -- the real work ---------------------------------------------------------------------------------
 
 ROLLS = (20.0, 60.0)
 
 
-def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
+def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for():
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
     scene, opd = dr.Scene(dr.Star(exposure=200.0)), dr.random_opd(1, npix=128)
     star = dr.simulate(model, scene, opd, seed=5)
@@ -804,7 +756,7 @@ def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
         assert light[core].sum() == pytest.approx((expected - star.data[0])[core].sum(), rel=0.1)
 
 
-def test_a_disk_and_the_whole_frames_are_part_of_the_job(tmp_path: Path) -> None:
+def test_a_disk_and_the_whole_frames_are_part_of_the_job(tmp_path):
     config = inputs(tmp_path, 1)
     # Other fields than those asked for are those of the preset in the filter of the frames.
     settings = GaussNewton.nircam("F356W", max_iterations=7)
@@ -818,7 +770,7 @@ def test_a_disk_and_the_whole_frames_are_part_of_the_job(tmp_path: Path) -> None
         assert work._options(job, frame, wide=False).wide is False
 
 
-def test_the_result_of_a_job_is_that_of_the_largest_field() -> None:
+def test_the_result_of_a_job_is_that_of_the_largest_field():
     wide_field = {"candidates": [{"snr": 7.0}], "contrast_curve": {k: [] for k in CURVE}}
     summary = {
         **result(), "status": {"name": "CONVERGED"}, "fit": {"reduced_chi2": 1, "error_factor": 1},
@@ -832,7 +784,7 @@ def test_the_result_of_a_job_is_that_of_the_largest_field() -> None:
     assert [each["snr"] for each in record["candidates"]] == [30.0]
 
 
-def test_a_planet_is_injected_into_the_frames_with_their_disk() -> None:
+def test_a_planet_is_injected_into_the_frames_with_their_disk():
     ones = np.ones((30, 30))
     cut = dr.Observation.from_arrays(3 * ones, ones, pixelscale=0.063).cutout(8)
     frame = FrameFit(
@@ -843,11 +795,11 @@ def test_a_planet_is_injected_into_the_frames_with_their_disk() -> None:
     assert (with_disk.observation.data == 3).all()
 
 
-def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
+def test_what_is_recovered_is_the_candidate_at_the_place():
     planet = Injection(1e-4, 0.6, 100.0)
     x, y = dr.Planet(1e-4, 0.6, 100.0 - 20.0).offset
 
-    def searched(*rows: tuple[float, float, float]) -> Any:
+    def searched(*rows):
         """Candidates of x, y and contrast, with an error of 1e-5."""
         table = np.reshape(rows, (-1, 3))
         errors = torch.full((len(table),), 1e-5, dtype=torch.float64)
@@ -857,7 +809,7 @@ def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
             detection_errors=errors,
         )
 
-        def measure(offsets: list[Any]) -> QTable:
+        def measure(offsets):
             np.testing.assert_allclose(offsets, [[x, y]])
             return QTable({"contrast": [4.5e-5], "contrast_error": [2e-5], "snr": [4.5]})
 
@@ -878,7 +830,7 @@ def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
 
 
 @pytest.mark.slow
-def test_files_with_and_without_a_planet(tmp_path: Path) -> None:
+def test_files_with_and_without_a_planet(tmp_path):
     """From calibrated files to the tables; test_slurm.py has a job with a real frame."""
     first = dr.Sequence.from_files([calints(tmp_path / "blank_calints.fits")]).science[0]
     model = dr.model_for(first, 41)

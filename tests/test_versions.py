@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import pytest
 from check_versions import lower_bounds, same
 from packaging.version import Version
 
 
-def test_what_is_installed_is_no_older_than_the_metadata_allow() -> None:
+def test_what_is_installed_is_no_older_than_the_metadata_allow():
     bounds = lower_bounds()
     assert {"torch", "numpy", "scipy", "astropy", "photutils", "poppy", "pyklip", "jinja2"} <= set(
         bounds
@@ -22,7 +21,7 @@ def test_what_is_installed_is_no_older_than_the_metadata_allow() -> None:
             assert Version(version(name)) >= Version(bound), name
 
 
-def test_a_requirement_without_a_lower_bound_is_named(tmp_path: Path) -> None:
+def test_a_requirement_without_a_lower_bound_is_named(tmp_path):
     path = tmp_path / "pyproject.toml"
     path.write_text(
         '[project]\ndependencies = ["torch>=2.6", "scipy"]\n'
@@ -41,5 +40,5 @@ def test_a_requirement_without_a_lower_bound_is_named(tmp_path: Path) -> None:
         ("2.0.1", "2.0", False),
     ],
 )
-def test_a_version_is_the_bound_up_to_zeros(installed: str, bound: str, expected: bool) -> None:
+def test_a_version_is_the_bound_up_to_zeros(installed, bound, expected):
     assert same(installed, bound) is expected
