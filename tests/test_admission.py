@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -122,16 +121,6 @@ def test_a_wavefront_map_is_no_frame(tmp_path, extension):
     calints(frames / "a.fits")
     hdus.writeto(frames / "map.fits")
     assert reasons(dr.Sequence.from_files(frames))["map.fits"].startswith("it is a wavefront map")
-
-
-def test_cards_that_say_the_same_or_nothing_change_nothing(tmp_path):
-    cards = {"BUNIT": "MJy sr-1", "EXPMID": 0.0, "INSTRUME": None, "PA_APER": 430.05}
-    calints(tmp_path / "a.fits", cards=cards)
-    calints(tmp_path / "b.fits", observation=2, roll=80.0)
-    first, second = dr.Sequence.from_files(tmp_path).science
-    assert first.mid_date is None
-    assert first.is_nircam
-    assert first.unit == second.unit
 
 
 def test_one_exposure_is_used_once(folder):
@@ -264,16 +253,6 @@ def test_a_roll_without_its_angle_is_excluded(folder, card, value):
     assert card in reasons(sequence)["x.fits"]
 
 
-def test_rolls_none_of_which_has_an_angle_are_refused(folder):
-    for path in folder.glob("jw*"):
-        fits.delval(path, "ROLL_REF", extname="SCI")
-    with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND}.*ROLL_REF"):
-        dr.Sequence.from_files(folder)
-    # One file needs no orientation.
-    (single,) = dr.Sequence.from_files(folder / FIRST).science
-    assert single.position_angles is None
-
-
 def test_the_sum_of_angles_stands_for_one_of_them():
     header = fits.Header({"ROLL_REF": 70.0, "PA_APER": 70.05})
     assert Exposure.of(header, "a.fits").position_angle == 70.05
@@ -318,14 +297,6 @@ def test_the_mask_is_known_by_any_of_three_cards(cards, mask):
 def test_masks_that_contradict_each_other_are_refused():
     with pytest.raises(CorruptFileError, match="CORONMSK MASKA335R, SUBARRAY SUB320A430R"):
         image_mask(fits.Header({"CORONMSK": "MASKA335R", "SUBARRAY": "SUB320A430R"}), "a.fits")
-
-
-def test_without_a_mask_there_is_no_model():
-    ones = np.ones((24, 24))
-    header = fits.Header({"INSTRUME": "NIRCAM"})
-    frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.06, filter="F444W", header=header)
-    with pytest.raises(IncompatibleSetupError, match="CORONMSK"):
-        dr.model_for(frame)
 
 
 def test_epochs_are_separate_sequences(folder):
@@ -446,14 +417,6 @@ def test_a_pixel_that_is_missing_at_the_peak_moves_nothing(shared_data, tmp_path
     assert len(sequence.science) == 2
 
 
-def test_of_two_frames_of_different_orientation_none_is_right(folder):
-    (folder / SECOND).unlink()
-    next(folder.glob("jw01184003*")).unlink()
-    calints(folder / SECOND, observation=2, roll=80.0, date="2022-10-03T09:00:00", change=turned)
-    with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND} contradict .* turned"):
-        dr.Sequence.from_files(folder)
-
-
 @pytest.mark.parametrize("x", [-3.0, 0.0, 3.0])
 def test_a_star_a_few_pixels_from_its_stated_place_is_behind_the_mask(folder, x):
     calints(
@@ -516,17 +479,6 @@ def test_an_integration_that_deviates_is_left_out_and_named(tmp_path, change, wo
     assert away.std() < 0.5
 
 
-def test_integrations_have_their_numbers_in_the_file(tmp_path):
-    def change(arrays):
-        arrays["DQ"][1] = 1
-        arrays["SCI"][5] *= 0.6
-
-    remarks = cube(tmp_path / "x.fits", change).remarks
-    assert [remark.split(" is left out")[0] for remark in remarks] == [
-        "integration 2 of 8", "integration 6 of 8",
-    ]  # fmt: skip
-
-
 def test_an_afterglow_in_one_integration_is_masked(tmp_path):
     def change(arrays):
         y, x = np.indices((SIDE, SIDE))
@@ -567,14 +519,6 @@ def test_every_integration_can_keep_its_place(tmp_path):
     assert kept.tolist() == [False, True, False, True, True, True]
     np.testing.assert_array_equal(every.data[kept], used.data)
     assert every.remarks == used.remarks
-
-
-def test_a_cube_of_several_rolls_is_split(tmp_path):
-    observation = cube(tmp_path / "x.fits", None, 2)
-    turned = replace(observation, position_angles=np.array([10.0, 40.0]))
-    assert [each.name for each in turned.pointings()] == [
-        "x.fits (pointing 1)", "x.fits (pointing 2)",
-    ]  # fmt: skip
 
 
 def neighbour(contrast, separation, angle):
@@ -699,15 +643,6 @@ def test_files_that_cannot_be_used_do_not_vote(folder, spoil, count, cards):
     assert as_before(sequence, folder)
     assert sorted(reasons(sequence)) == names
     assert all(reasons(sequence).values())
-
-
-def test_a_copy_of_an_exposure_that_can_be_used_stands_in_for_it(folder):
-    path = folder / FIRST
-    (folder / FIRST.replace("calints", "crfints")).write_bytes(path.read_bytes())
-    without("ERR")(path)
-    sequence = dr.Sequence.from_files(folder)
-    assert uses(sequence)[FIRST.replace("calints", "crfints")] == "target"
-    assert "ERR" in reasons(sequence)[FIRST]
 
 
 def test_segments_of_an_exposure_are_one_roll(folder):

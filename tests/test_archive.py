@@ -143,12 +143,6 @@ def test_a_name_that_leaves_the_folder_is_refused(mast, tmp_path, name):
     assert mast.fetched == []
 
 
-def test_without_a_filter_all_files_of_the_star_are_listed(mast):
-    listing = archive.list_calints(1184, "G-7-34", folder="nowhere")
-    assert mast.asked["obsid"] == ["1", "2"]
-    assert list(listing["filter"]) == ["F444W;MASKRND"] * 2 + ["F356W;MASKRND"]
-
-
 @pytest.mark.parametrize("failure", ["short", "offline", "interrupted"])
 def test_a_part_of_a_file_is_not_taken_for_a_file(mast, tmp_path, failure):
     if failure == "short":
@@ -174,15 +168,6 @@ def test_a_file_that_has_changed_in_the_archive_is_fetched_again(mast, tmp_path)
     assert (tmp_path / FILES[0]).stat().st_size == SIZE
 
 
-def test_a_file_of_unknown_size_has_to_be_a_whole_one(mast, tmp_path):
-    products = mast.get_unique_product_list(Table({"obsid": ["1"]}))
-    products["size"].mask = True
-    mast.get_unique_product_list = lambda _: products
-    with pytest.raises(OSError, match="FITS"):
-        archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
-    assert left(tmp_path) == []
-
-
 def test_proprietary_files_need_a_token(mast, tmp_path, monkeypatch):
     mast.rights[NAMES[1]] = "EXCLUSIVE_ACCESS"
     with pytest.warns(DiffrenderWarning, match=rf"proprietary.*{FILES[1]}"):
@@ -194,16 +179,6 @@ def test_proprietary_files_need_a_token(mast, tmp_path, monkeypatch):
     monkeypatch.setenv("MAST_API_TOKEN", "secret")
     assert len(archive.fetch_calints(1184, filter="F444W", folder=tmp_path)) == 2
     assert mast.tokens == ["secret"]
-
-
-def test_a_refused_file_is_an_error_with_the_archives_words(mast, tmp_path):
-    """The archive's list may say public what its server does not give."""
-    products = mast.get_unique_product_list(Table({"obsid": ["1"]}))
-    mast.get_unique_product_list = lambda _: products
-    mast.rights[NAMES[0]] = "EXCLUSIVE_ACCESS"
-    with pytest.raises(ArchiveError, match=r"401 Client Error.*0 of 2 files"):
-        archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
-    assert left(tmp_path) == []
 
 
 def test_without_a_network_the_message_says_so(mast, tmp_path):
@@ -236,11 +211,6 @@ def test_a_programme_without_coronagraphy_is_an_error(mast):
     mast.rows = []
     with pytest.raises(ArchiveError, match="no coronagraphic frames of NIRCam of programme 1"):
         archive.list_calints(1)
-
-
-def test_the_cache_is_the_users(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert archive.cache_folder() == tmp_path / "pyklip_diffrender" / "mast"
 
 
 REDUCE = ["reduce", "--program", "1184", "--filter", "F444W", "--opd", "opd.fits"]

@@ -31,7 +31,6 @@ from pyklip.klip import high_pass_filter
 # As a script does it, long before the plugin is imported.
 from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender import backend as backend_module_or_function
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -356,18 +355,6 @@ def test_lite_and_double_precision_and_no_derotation(imgs, tmp_path):
 
 
 @pytest.mark.usefixtures("registered")
-def test_aligned_frames_are_saved_as_by_klip(imgs, tmp_path):
-    saved = []
-    for algo in ("klip", "diffrender"):
-        dataset = generic(imgs, ANGLES)
-        center = np.array([20.0, 22.0])
-        reduce(dataset, tmp_path / algo, algo=algo, save_aligned=True, aligned_center=center)
-        saved.append(dataset.aligned_and_scaled)
-    assert saved[0].dtype == saved[1].dtype
-    np.testing.assert_allclose(saved[0], saved[1], rtol=1e-5, equal_nan=True)
-
-
-@pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("highpass", [True, 12.0])
 def test_high_pass_filter_acts_after_the_fit(highpass, imgs, tmp_path):
     plain, filtered = generic(imgs, ANGLES), generic(imgs, ANGLES)
@@ -382,14 +369,6 @@ def test_high_pass_filter_acts_after_the_fit(highpass, imgs, tmp_path):
     np.testing.assert_allclose(got[ring], (expected - np.median(expected[ring]))[ring], atol=0.02)
     with pytest.raises(IncompatibleSetupError, match="high-pass filtered by an earlier call"):
         reduce(copy.deepcopy(filtered), tmp_path / "c")
-
-
-def test_a_filter_by_klip_is_noticed_too(imgs, tmp_path):
-    with backend(opd=OPD, subtractor=render, force=False):
-        dataset = generic(imgs, ANGLES)
-        reduce(dataset, tmp_path, algo="klip", highpass=True)
-        with pytest.raises(IncompatibleSetupError, match="high-pass"):
-            reduce(dataset, tmp_path)
 
 
 # Where settings come from
@@ -581,15 +560,6 @@ def test_masked_frames(imgs, tmp_path):
     np.testing.assert_array_equal(finite, [True, False, True])
 
 
-@pytest.mark.usefixtures("registered")
-def test_a_missing_folder_is_found_before_the_fit(imgs, tmp_path):
-    def fake(*args):
-        raise AssertionError("fitted for nothing")
-
-    with backend(subtractor=fake), pytest.raises(FileNotFoundError, match="not a folder"):
-        klip_dataset(generic(imgs, ANGLES), outputdir=tmp_path / "no", algo="diffrender")
-
-
 @pytest.mark.parametrize("where", ["fit", "shape", "nothing", "writing"])
 def test_a_failure_raises_and_leaves_everything_as_it_was(where, imgs, tmp_path, monkeypatch):
     before = spied(monkeypatch)
@@ -709,16 +679,3 @@ def test_errors_that_are_given(imgs):
     dataset.diffrender = DiffrenderSettings(error=np.zeros(7))
     with pytest.raises(ShapeError, match="expected a number"):
         observation_from_dataset(dataset)
-
-
-def test_which_wavelength(imgs):
-    dataset = generic(imgs, ANGLES, wvs=[4.0, 4.4, 4.4])
-    with pytest.raises(IncompatibleSetupError, match="choose one"):
-        observation_from_dataset(dataset)
-    with pytest.raises(IncompatibleSetupError, match="the dataset has"):
-        observation_from_dataset(dataset, 3.0)
-    assert len(observation_from_dataset(dataset, 4.4).data) == 2
-
-
-def test_the_package_attribute_is_the_function():
-    assert backend_module_or_function is backend

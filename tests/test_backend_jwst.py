@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
-from backend_scene import CENTER, OPD, SHAPE, calints, in_place_of_fits, planet, psf, render
+from backend_scene import OPD, SHAPE, calints, in_place_of_fits, render
 from pyklip import fakes
 from pyklip.instruments import JWST
 from pyklip.instruments.JWST import JWSTData
-from pyklip.klip import align_and_scale, high_pass_filter
+from pyklip.klip import high_pass_filter
 from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender.errors import DiffrenderWarning, NoValidPixelsError
+from pyklip_diffrender.errors import DiffrenderWarning
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     backend,
@@ -269,18 +269,6 @@ def test_a_dataset_read_before_registering_still_works(files, tmp_path):
 
 
 @pytest.mark.usefixtures("registered")
-def test_pixels_in_double_precision(files, tmp_path):
-    """pyKLIP then shifts in double precision, too."""
-    expected, _ = reduce(JWSTData(files), tmp_path / "out")
-    for path in files:
-        with fits.open(path, mode="update") as hdus:
-            hdus["SCI"].data = hdus["SCI"].data.astype(np.float64)
-    image, header = reduce(JWSTData(files), tmp_path / "out")
-    assert (header["DRPIXELS"], header["DRNOISE"]) == ("recorded", "ERR")
-    np.testing.assert_allclose(image, expected, atol=1e-4)
-
-
-@pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("factor", [1e-3, 1e3, "each"])
 def test_frames_that_were_multiplied_after_reading(factor, files, tmp_path):
     """The fit has the unit of the files, and the products that of the dataset."""
@@ -369,42 +357,6 @@ def test_files_without_errors_or_flags(tmp_path, rng):
     assert observation.valid.all()
     assert (observation.error > 0).all()
     np.testing.assert_array_equal(observation.data[0], science.data)
-
-
-@pytest.mark.usefixtures("registered")
-def test_all_flagged(files, tmp_path):
-    for path in files:
-        with fits.open(path, mode="update") as hdus:
-            hdus["DQ"].data[:] = 1
-    with pytest.raises(NoValidPixelsError, match=r"jw01386000_calints.*DQ flags"):
-        reduce(JWSTData(files), tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
-
-
-@pytest.mark.usefixtures("registered")
-def test_no_files(tmp_path):
-    with pytest.raises(UserWarning, match="No science files"):
-        JWSTData([])
-
-
-@pytest.mark.usefixtures("registered")
-def test_a_reader_that_shifts_otherwise_is_not_believed(files, monkeypatch):
-    def other(img, new_center, old_center=None, **kw):
-        return align_and_scale(img, new_center, np.asarray(old_center) + 0.5, **kw)
-
-    calls = []
-
-    def alternate(*args, **kw):
-        calls.append(args)
-        return (other if len(calls) <= 4 else align_and_scale)(*args, **kw)
-
-    monkeypatch.setattr("pyklip.klip.align_and_scale", alternate)
-    dataset = JWSTData(files)
-    assert not hasattr(dataset, "_diffrender_source")
-    with pytest.warns(DiffrenderWarning, match="shifted these frames in a way not known here"):
-        observation_from_dataset(dataset)
-    assert np.isfinite(psf(*CENTER)).all()
-    assert planet(*CENTER).max() > 0.8
 
 
 def test_the_real_frames(shared_data, tmp_path):

@@ -102,12 +102,6 @@ def test_reference_frames_in_the_dataset_stay_out_of_the_products(files, tmp_pat
     np.testing.assert_array_equal(shown, frames.usable)
 
 
-def test_a_reference_star_may_be_the_target(files):
-    frames = gathered(JWSTData(files[2:]))
-    assert frames.usable.all()
-    assert frames.references == ()
-
-
 def test_frames_that_spaceklip_shifted_are_put_back(files, tmp_path, caplog):
     path = files[0]
     with fits.open(path) as hdus:

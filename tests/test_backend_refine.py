@@ -17,15 +17,8 @@ from pyklip.klip import rotate
 from pyklip.parallelized import klip_dataset
 from scipy.ndimage import map_coordinates
 
-from pyklip_diffrender.detection import detect
-from pyklip_diffrender.errors import (
-    DiffrenderWarning,
-    IncompatibleSetupError,
-    NoValidPixelsError,
-    RefinementError,
-)
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern import PatternChoice
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
@@ -34,7 +27,7 @@ from pyklip_diffrender.pyklip_backend import (
     subtract_by_refinement,
 )
 from pyklip_diffrender.pyklip_backend.output_files import on_product, throughput_map
-from pyklip_diffrender.refinement import GaussNewton, Status, refine
+from pyklip_diffrender.refinement import GaussNewton, refine
 from pyklip_diffrender.scene.jwst_files import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation, Window
@@ -341,30 +334,6 @@ def test_companions_are_kept_by_default_in_real_frames_only(
     assert bool(given_back) == kept
 
 
-def test_a_second_fit_that_fails_stops_the_reduction_too(small, monkeypatch):
-    """The search may have fitted the star again, with companions."""
-
-    def worse(fit, **options):
-        found = detect(fit, **options)
-        return replace(found, fits=(replace(fit, status=Status.DIVERGED),))
-
-    monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.detect", worse)
-    star = FLUX * small(OLD.data).numpy() + SKY
-    observation = Observation.from_arrays(star, np.sqrt(star), pixelscale=small.detector.pixelscale)
-    settings = DiffrenderSettings(model=small, fit=ALIGNED, keep_detected=True)
-    with pytest.raises(RefinementError, match="no light"):
-        subtract_by_refinement(observation, OLD, settings)
-
-
-def test_a_model_without_recipe_is_good_for_its_own_square(small, frames, tmp_path, caplog):
-    bare = OpticalSystem(small.entrance, small.planes, small.detector, small.bandpass)
-    made = dataset(frames[:1], bare, fit_pixels=32)
-    with backend(opd=OLD, fit=ALIGNED, max_chi2=np.inf), pytest.warns(DiffrenderWarning):
-        image, _ = reduce(made, tmp_path)
-    assert "pixels outside its 32 x 32 are NaN" in caplog.text
-    assert 800 < np.isfinite(image).sum() <= 32**2
-
-
 @pytest.mark.parametrize("wrong", ["nothing", "centre", "filter"])
 def test_a_header_that_contradicts_the_data_stops_the_reduction(wrong, small, frames, tmp_path):
     model, numerics = small, {**NUMERICS, "monochromatic": 3.56e-6}
@@ -472,23 +441,3 @@ def test_frames_that_were_moved_for_the_fit_are_subtracted_where_they_are(side, 
     unmoved = (shift_frames(star[np.newaxis], away[np.newaxis])[0] - star)[inner]
     assert np.sqrt(np.mean(wrong**2)) < 0.2
     assert np.sqrt(np.mean((unmoved / np.sqrt(star)[inner]) ** 2)) > 1.0
-
-
-def test_windows_that_stick_out_of_the_frame(rng):
-    cube = rng.normal(size=(2, 10, 12))
-    observation = Observation.from_arrays(cube, np.ones_like(cube), pixelscale=0.06, center=(1, 8))
-    window = Window.about(observation.center[0], (5, 7))
-    part = observation.within(window)
-    assert part.shape == (5, 7)
-    np.testing.assert_array_equal(part.center, [[3, 2]] * 2)
-    assert part.valid.sum() == 2 * 4 * 5
-    back = window.paste(part.data[0], (10, 12))
-    kept = np.isfinite(back)
-    assert kept.sum() == 4 * 5
-    np.testing.assert_array_equal(back[kept], cube[0][kept])
-    with pytest.raises(NoValidPixelsError, match="Check the star centre"):
-        observation.within(Window.about(np.array([-40.0, 5.0]), (5, 7)))
-
-    observation.valid[:] = False
-    observation.valid[1, 2:5, 3:9] = True
-    assert Window.holding(observation.valid) == Window(2, 3, (3, 6))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import re
-from typing import Any
 
 import astropy.units as u
 import numpy as np
@@ -14,15 +13,11 @@ import pytest
 import random_poppy
 import torch
 from astropy.io import fits
-from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 
 from pyklip_diffrender.bridges import from_poppy, opd_to_poppy
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.optics.grid import resample
-
-Array = NDArray[np.float64]
-Plane = tuple[str, Any]
 
 DETECTOR = {"pixelscale": 0.05, "fov_pixels": 40, "oversample": 2}
 WAVELENGTH = 4.5e-6
@@ -308,16 +303,6 @@ def test_intermediate_wavefronts_are_those_of_poppy():
     assert np.abs(compact[4].intensity - part).max() < 1e-12 * part.max()
     _, (last,) = model.calc_psf(return_final=True)
     assert relative(last.intensity, theirs[-1].intensity) < 1e-12
-
-
-def test_planes_keep_names_and_order():
-    system = make(pupil(), ("invert", "y"), zernikes(), spot(), stop())
-    model = from_poppy(system, WAVELENGTH)
-    names = [p.name for p in (model.entrance, *model.planes, model.detector)]
-    assert names == [p.name for p in system.planes]
-    assert model.plane("spot").name == "spot"
-    with pytest.raises(KeyError, match="not a plane of this system"):
-        model.plane("spott")
 
 
 def test_later_changes_to_the_users_object_do_not_reach_the_model():

@@ -14,7 +14,6 @@ import pytest
 import torch
 from astropy import units as u
 from astropy.io import fits
-from numpy.typing import NDArray
 from stpsf_data import lopsided, lyot_stop, pupil, zernike_tensor
 
 from pyklip_diffrender.bridges import from_webbpsf, opd_to_webbpsf
@@ -31,8 +30,6 @@ from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, zernike_basis
 from pyklip_diffrender.optics.planes import EntrancePupil
 from pyklip_diffrender.optics.system import OpticalSystem
-
-Array = NDArray[np.float64]
 
 NPIX = 256
 FAST = {"monochromatic": 4.5e-6, "fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 60}
@@ -279,15 +276,6 @@ def test_the_embedded_coronagraph_has_the_orientation_of_stpsf(nircam):
     assert error(embedded(offset=(0.31, 0.12)), truth) > 0.1
 
 
-def test_batches_of_wavefronts_and_stars(nircam):
-    model = from_webbpsf(nircam(), add_distortion=True, **FAST)
-    opds = torch.from_numpy(np.stack([lopsided(NPIX, k, 5e-8) for k in (1, 2)]))
-    stars = torch.tensor([[0.1, 0.0], [0.0, -0.2]])
-    both = model(opds, star_offset=stars)
-    for k in (0, 1):
-        assert error(both[k], model(opds[k], star_offset=stars[k])) < 1e-12
-
-
 def test_another_instrument_is_refused(stpsf_path):
     with pytest.raises(IncompatibleSetupError, match=r"expected an stpsf\.NIRCam"):
         from_webbpsf("NIRCam")
@@ -316,15 +304,6 @@ def test_maps_that_cannot_be_right(nircam, change, expected, complaint):
         from_webbpsf(instrument, **FAST)
     with pytest.raises(expected, match=complaint):
         opd_to_webbpsf(opd, nircam())
-
-
-def test_a_map_upside_down_is_noticed(nircam):
-    instrument = nircam()
-    opd = (lopsided(NPIX, 8, 60e-9) * pupil(NPIX))[::-1]
-    header = fits.Header({"BUNIT": "m", "PUPLSCAL": JWST_DIAMETER / NPIX})
-    instrument.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
-    with pytest.warns(DiffrenderWarning, match="match the pupil upside down"):
-        from_webbpsf(instrument, **FAST)
 
 
 def test_a_map_of_another_size_is_resampled(nircam):

@@ -351,15 +351,6 @@ def test_a_claim_is_what_the_table_says(claim):
     assert phrase in text, f"{claim.document} does not say: {phrase}"
 
 
-def test_a_wrong_number_is_noticed(monkeypatch):
-    changed = table("stated_numbers").copy()
-    changed["value"] *= 1.1
-    monkeypatch.setitem(globals(), "table", lambda name: changed)
-    claim = next(each for each in CLAIMS if "the only candidate" in each.phrase)
-    with pytest.raises(AssertionError, match="does not say"):
-        test_a_claim_is_what_the_table_says(claim)
-
-
 SETTINGS = (
     r"\[[^]]*\]\([^)]*\)|`[^`]*`",  # Links and code.
     r"F\d{3}[WMN]|MASK\w+|G 7-34|HIP \d+|[Pp]rogramme \d+|5-sigma|2MASS",
@@ -389,14 +380,6 @@ def test_results_of_readme_and_paper_are_all_claims(document, begin, end):
 
 ALLOWED = {"README.md": {"(F444W"}, "paper/paper.md": {"10", "@carter2023"}}
 """Words with digits that are left: settings, and errors that the text explains elsewhere."""
-
-
-def test_the_page_of_real_frames_has_few_numbers():
-    text = (ROOT / PAGE).read_text(encoding="utf-8")
-    for pattern in SETTINGS[:2]:
-        text = re.sub(pattern, "", text)
-    numbers = re.findall(r"(?<![\w.])\d[\d.]*(?:e-?\d+)?", text)
-    assert 60 < len(numbers) <= 120
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*.ecsv")), ids=lambda path: path.name)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
 import shutil
-import subprocess
-import sys
 import tomllib
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
@@ -23,17 +20,13 @@ import pytest
 import torch
 from astropy.io import fits
 
-from benchmarks.calints_files import calints
-from pyklip_diffrender import __version__
 from pyklip_diffrender.cli import application, main
-from pyklip_diffrender.cli.reducing import describe_plan, steps_of
 from pyklip_diffrender.cli.session import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.reduction import UNFINISHED, Preparation, ReduceOptions
-from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront.opd import RULES, random_opd, resample
+from pyklip_diffrender.wavefront.opd import random_opd, resample
 
 # The package has the command under the name of its module.
 doctor = import_module("pyklip_diffrender.cli.application")
@@ -58,22 +51,6 @@ def opd_file(path, unit="nm"):
         hdu.header["BUNIT"] = unit
     hdu.writeto(path)
     return path
-
-
-def test_help_names_the_commands(capsys):
-    assert main(["--help"]) == 0
-    shown = capsys.readouterr().out
-    for command in ("demo", "reduce", "detect", "psf", "doctor"):
-        assert command in shown
-
-
-def test_threads_sleep_while_they_wait(monkeypatch):
-    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
-    assert main(["--version"]) == 0
-    assert os.environ["OMP_WAIT_POLICY"] == "active"
-    monkeypatch.delenv("OMP_WAIT_POLICY")
-    assert main(["--version"]) == 0
-    assert os.environ["OMP_WAIT_POLICY"] == "passive"
 
 
 @pytest.mark.parametrize("command", ["demo", "reduce", "detect", "psf"])
@@ -117,23 +94,6 @@ def test_wrong_options_are_usage_errors(tmp_path, monkeypatch, capsys, arguments
     assert not PYTHON.search(shown.err)
     assert shown.out == ""
     assert list(tmp_path.iterdir()) == []
-
-
-def test_help_does_not_wait_for_torch():
-    program = (
-        "import sys, pyklip_diffrender.cli as cli\n"
-        "cli.main(['--help'])\n"
-        "heavy = {'torch', 'numpy', 'pyklip', 'matplotlib', 'poppy'} & set(sys.modules)\n"
-        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def test_psf_writes_the_image_of_the_model(tmp_path, capsys):
@@ -186,14 +146,6 @@ def test_errors_go_to_stderr_and_nothing_is_written(tmp_path, monkeypatch, capsy
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_map_without_a_unit_is_an_error(tmp_path, capsys):
-    opd = opd_file(tmp_path / "opd.fits", unit=None)
-    product = tmp_path / "star.fits"
-    assert main(["psf", "-o", str(product), *WAVELENGTH, "--opd", str(opd)]) == 1
-    assert "opd.fits: the header has no BUNIT" in capsys.readouterr().err
-    assert not product.exists()
-
-
 @pytest.mark.parametrize("percent", [0, 50])
 def test_detect_in_a_broken_file_leaves_no_product(tmp_path, capsys, percent):
     frames, products = tmp_path / "calints.fits", tmp_path / "products"
@@ -207,11 +159,6 @@ def test_detect_in_a_broken_file_leaves_no_product(tmp_path, capsys, percent):
     assert main(["detect", str(frames), "--opd", str(opd), "-o", str(products)]) == 1
     assert "calints.fits" in capsys.readouterr().err
     assert not products.exists()
-
-
-def test_version(capsys):
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"pyklip-diffrender {__version__}\n"
 
 
 def test_an_image_is_replaced_only_when_told_to(tmp_path, capsys):
@@ -393,47 +340,6 @@ def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
     assert "--resume keeps products" in capsys.readouterr().err
 
 
-def test_frames_without_a_map_start_from_a_flat_wavefront(tmp_path, frames, reduced, capsys):
-    arguments = ["reduce", str(frames), "--opd", "flat", "-o", str(tmp_path / "products")]
-    assert main([*arguments, "--size", "8"]) == 0
-    assert "wavefront map: flat wavefront\n" in capsys.readouterr().out
-    (call,) = reduced
-    assert not call.given.wavefront.data.any()
-
-
-def test_an_estimate_counts_the_fits_that_are_made(frames):
-    def steps(sequence, **options):
-        return dict(steps_of(sequence, ReduceOptions(size=8, **options)))
-
-    sequence = Sequence.from_files(frames).cutout(8)
-    names = list(steps(sequence))
-    assert names == ["wavefront", "reference stars and target together", "search", "products"]
-    for_pattern = steps(sequence, references="pattern")
-    assert list(for_pattern) == ["reference star HIP-2", "wavefront", "search", "products"]
-    alone = steps(replace(sequence, references=()))
-    assert len(alone) == len(names) - 1
-    twice = replace(sequence, science=sequence.science * 2)
-    both = steps(twice, systematics="off", references="off")
-    assert both["search"] == 2 * alone["search"]
-    one, two = alone["wavefront"], both["wavefront"]
-    assert one < two < 2 * one
-    more = steps(twice, systematics="off", disk=True, references="off")
-    assert more.items() > both.items()
-    assert more["search without extended light"] == more["search"]
-    assert more["extended light, and wavefront without it"] > one
-    eight = steps(twice, systematics="off", injections=8, references="off")
-    assert eight["8 injected planets"] == 2 * (both["wavefront"] + both["search"])
-    both_kinds = steps(twice, systematics="off", injections=8, disk=True)
-    longer = both_kinds["8 injected planets"] - eight["8 injected planets"]
-    assert longer == pytest.approx(2 * more["extended light, and wavefront without it"])
-    tied = steps(twice, systematics="off", star_flux=0.4)
-    assert tied["wavefront"] == pytest.approx(1.6 * two)
-    whole = steps(twice, systematics="off", wide=True)
-    assert whole["whole frames"] > 0
-    quick = steps(twice, systematics="off", accuracy="quick")
-    assert quick["wavefront"] < both["wavefront"]
-
-
 SUMMARY = {
     "sentence": "One companion.",
     "status": {
@@ -604,12 +510,6 @@ def test_too_little_memory_is_a_message(tmp_path, frames, maps, capsys, reduced,
         main(arguments)
 
 
-def test_impossible_arguments_are_messages(tmp_path, frames, capsys):
-    products = ["-o", str(tmp_path / "products")]
-    assert main(["detect", str(frames), "--opd", "nowhere.fits", *products]) == 1
-    assert "is a folder, expected a file; the command reduce" in capsys.readouterr().err
-
-
 def test_an_interrupted_run_says_what_it_left(tmp_path, frames, maps, reduced, capsys):
     products = tmp_path / "products"
     products.mkdir()
@@ -644,29 +544,6 @@ def test_mast_is_asked_for_the_map_of_the_date(tmp_path, frames, reduced, capsys
     assert main([*arguments, "--opd-date", "after", "--overwrite"]) == 1
     assert "no route to host" in capsys.readouterr().err
     assert asked == [("2022-07-30T02:03:04", "nearest"), ("2022-07-30T02:03:04", "after")]
-
-
-@pytest.mark.parametrize(
-    ("path", "words"),
-    [("nowhere/star.fits", "there is no folder"), (".", "is a folder, expected a file")],
-)
-def test_an_image_goes_into_a_folder_that_exists(tmp_path, capsys, path, words):
-    assert main(["psf", "-o", str(tmp_path / path)]) == 1
-    assert words in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_without_permission_is_refused_before_the_work(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
-    assert main(["demo", "-o", str(tmp_path / "products" / "deep")]) == 1
-    assert f"no permission in {tmp_path}\n" in capsys.readouterr().err
-
-
-def test_a_device_that_is_not_there_is_an_error(tmp_path, capsys):
-    path = tmp_path / "star.fits"
-    assert main(["psf", "-o", str(path), "--device", "abacus"]) == 1
-    assert "--device: PyTorch" in capsys.readouterr().err
-    assert not path.exists()
 
 
 def test_a_written_configuration_gives_the_same_run(tmp_path, frames, maps, reduced, capsys):
@@ -721,15 +598,6 @@ def test_checks_of_options_name_the_configuration_that_they_may_come_from(tmp_pa
     assert "taken from" not in capsys.readouterr().err
 
 
-def test_mistakes_of_a_survey_are_in_the_words_of_its_configuration(tmp_path, capsys):
-    config = tmp_path / "survey.toml"
-    config.write_text("[options]\nsize = 2\n[[sequence]]\nfiles = '.'\nopd = 'flat'\n")
-    assert main(["survey", str(config), "-o", str(tmp_path / "out")]) == 1
-    shown = capsys.readouterr().err
-    assert "options: size: got 2" in shown
-    assert "--size" not in shown
-
-
 def test_a_missing_map_is_answered_with_what_there_is(capsys):
     for command in (
         ["detect", "x", "-o", "y"],
@@ -744,13 +612,6 @@ def test_a_missing_map_is_answered_with_what_there_is(capsys):
         assert "flat to start without one" in shown
 
 
-def test_tables_of_a_configuration_are_commands(tmp_path, capsys):
-    config = tmp_path / "run.toml"
-    config.write_text("quiet = true\n[fit]\nsize = 20\n")
-    assert main(["--config", str(config), "psf", "-o", str(tmp_path / "star.fits")]) == 2
-    assert "[fit] is no command" in capsys.readouterr().err
-
-
 def test_the_documented_configuration_is_valid(tmp_path):
     page = (ROOT / "docs" / "reference" / "command_line.md").read_text(encoding="utf-8")
     example = page.partition("```toml\n")[2].partition("```")[0]
@@ -758,32 +619,6 @@ def test_the_documented_configuration_is_valid(tmp_path):
     path = tmp_path / "run.toml"
     path.write_text(example)
     assert read_config(application, path)["reduce"]["log_file"] == "products/run.log"
-
-
-def test_the_rules_are_those_of_the_package():
-    (option,) = (p for p in application.commands["reduce"].params if p.name == "opd_date")
-    assert tuple(option.type.choices) == RULES
-
-
-@pytest.mark.parametrize(
-    ("words", "completed"), [("--opd-", "plain,--opd-date"), ("--star-sed star", "file,star")]
-)
-def test_the_shell_completes_options_and_files(words, completed):
-    """What the shell's completion function calls."""
-    done = subprocess.run(
-        [sys.executable, "-m", "pyklip_diffrender.cli"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={
-            **os.environ,
-            "PYTHONPATH": str(ROOT),
-            "_PYKLIP_DIFFRENDER_COMPLETE": "bash_complete",
-            "COMP_WORDS": f"pyklip-diffrender reduce {words}",
-            "COMP_CWORD": str(1 + len(words.split())),
-        },
-    )
-    assert done.stdout.splitlines() == [completed], done.stderr
 
 
 @pytest.mark.slow
@@ -814,12 +649,3 @@ def test_doctor_fails_with_a_sentence(tmp_path, monkeypatch):
         assert words in failed.text
     assert doctor.memory_check(8e9).text == "8.0 GB of memory are free"
     assert doctor.memory_check(None).state == "note"
-
-
-def test_the_plan_says_what_reading_a_large_file_takes(tmp_path):
-    path = calints(tmp_path / "a_calints.fits")
-    sequence = Sequence.from_files([path])
-    usual = describe_plan(sequence, ReduceOptions())
-    os.truncate(path, 10 * 10**9)  # Sparse: it takes no room.
-    assert "1.8 GB of memory" in usual
-    assert "8.7 GB of memory" in describe_plan(sequence, ReduceOptions())

@@ -18,7 +18,7 @@ from synthetic_searches import CURVATURE, PIXEL, noise, searched
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.cli.reducing import combined
-from pyklip_diffrender.detection import Motion, SkyMap, hypotheses
+from pyklip_diffrender.detection import Motion
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.sky_map import Family, SkyStack
 from pyklip_diffrender.detection.templates import weigh
@@ -197,24 +197,6 @@ def test_errors_that_are_hardly_known_need_a_higher_peak():
     np.testing.assert_allclose(known.snr, unsure.snr)
 
 
-def test_side_lobes_of_a_bright_candidate_are_no_candidates():
-    """What a search explains by its own candidates is not searched again."""
-    bright = searched("F444W", 1, [(0.6, 0.3, 300.0)], known=True)
-    lobe = searched("F444W", 1, [(0.6, 0.3, 300.0), (-0.5, -0.4, 8.0)], known=True)
-    snr = np.where(np.hypot(*np.moveaxis(lobe.grid, -1, 0)) < 9, lobe.snr, 0)
-    both = dr.combine([replace_maps(bright, snr), searched("F356W", 2)])
-    assert len(both.candidates) == 1
-    assert both.candidates["snr_F444W"][0] == pytest.approx(300, rel=1e-3)
-
-
-def replace_maps(detection, snr):
-    """The detection with another map, whose residual stays as it is."""
-    changed = replace(detection, snr=snr)
-    for name in ("observation", "sky", "provenance"):
-        vars(changed)[name] = getattr(detection, name)
-    return changed
-
-
 def test_a_bad_fit_is_left_out_and_its_candidates_with_it():
     bad = searched("F444W", 1, [(0.6, 0.3, 40.0)], status="MODEL_MISMATCH", known=True)
     good = [searched("F356W", 2), searched("F300M", 3)]
@@ -306,12 +288,6 @@ def test_noise_has_as_many_peaks_as_expected(names):
             assert share - 3 * spread < expected < 1.5 * share + 4 * spread, (name, level, share)
 
 
-def test_the_curvature_of_a_map_is_measured():
-    turned = SkyMap.of(searched(side=121, seed=4, north=30.0), "map")
-    # Of 121 x 121 pixels, of which about 800 are independent.
-    np.testing.assert_allclose(turned.curvature, CURVATURE * np.eye(2), atol=0.1 * CURVATURE)
-
-
 def test_parallax_and_proper_motion_are_those_of_astropy():
     star = SkyCoord(80.0 * u.deg, -30.0 * u.deg, distance=10 * u.pc)
     motion = Motion(MOTION, 0.1, (80.0, -30.0))
@@ -376,28 +352,6 @@ def test_orbits_allow_a_bound_source_to_move():
     orbit = dr.combine(found, proper_motion=(1.0, 1.0), parallax=0.1)
     assert set(orbit.candidates["verdict"]) == {"moves with the star"}
     assert len(orbit.candidates) == 1
-
-
-def test_more_background_sources_are_told_apart_the_farther_the_star_moves():
-    """Of seeded sources of S/N 8, whose places are known to 0.011 arcsec."""
-    shares = []
-    for motion in (0.01, 0.05, 0.15):
-        told = 0
-        for seed in range(12):
-            start = np.array([0.5, 0.45])
-            end = start - [motion, 0.0]
-            maps = [SkyMap.of(each, str(k)) for k, each in
-                    enumerate(epochs((*start, 8.0), (*end, 8.0), seed, YEAR))]  # fmt: skip
-            flux = dict.fromkeys(("0", "1"), 1.0)
-            result = hypotheses(maps, flux, start, 59900.0, Motion((motion, 0.0)))
-            total = result.bound + result.background + result.neither
-            assert total == pytest.approx(1)
-            told += result.verdict.startswith("stays")
-            assert not result.verdict.startswith("moves")
-        shares.append(told / 12)
-    assert shares[0] <= shares[1] <= shares[2]
-    assert shares[0] < 0.2
-    assert shares[2] > 0.9
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 import pyklip_diffrender as dr
 from benchmarks.planets import searched
@@ -16,8 +15,6 @@ from pyklip_diffrender.detection.candidates import (
     lacks_candidates,
     unconfirmed_companions,
 )
-from pyklip_diffrender.detection.search import with_raised_peaks
-from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 
 FOUND = Candidates.at([[0.6, 0.3]], [3e-4])
 
@@ -66,11 +63,6 @@ def test_fits_of_reference_stars_have_no_candidates():
     assert not lacks_candidates([fit((3e-4, 0.6, 0.3)), fit(reference=True)], FOUND)
 
 
-def test_nothing_is_tried_where_the_data_are_explained():
-    explained = SimpleNamespace(status=dr.Status.CONVERGED)
-    assert with_raised_peaks([explained], None, FOUND, 0.2) is None
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "cycles"),
@@ -90,43 +82,6 @@ def test_a_planet_that_ends_a_fit_at_a_wrong_wavefront_is_found(seed, cycles):
     assert not outcome.false
     # The errors of bright companions are those of the star's flux, about 0.1 %.
     assert abs(outcome.pull) < 4
-
-
-def test_a_step_is_linear_in_the_light_of_a_companion():
-    """The light is contrast times flux; in contrast and flux, a long step would be quadratic."""
-    start = {"flux": torch.tensor([2e5]), "background": torch.zeros(1)}
-    planet = dr.Planet.from_offset(0.1, 0.4, 0.3)
-    frames = tuple(
-        FrameUnknowns(("flux", "background"), start, modes=2, companions=(planet,),
-                      shows_companions=shows)
-        for shows in (True, False)
-    )  # fmt: skip
-    unknowns = Unknowns(frames, own=("flux",))
-    vector = unknowns.initial()
-    step = torch.zeros(len(vector))
-    first, other = (rows.rows[frames[0].where("flux")] for rows in unknowns.rows)
-    place = unknowns.where("companions").start
-    step[first], step[other], step[place] = 6e5, 9e5, -0.25
-    moved = unknowns.stepped(vector, step)
-    # 2e5 x 0.1, and its linear change 6e5 x 0.1 - 2e5 x 0.25.
-    assert float(moved[first] * moved[place]) == pytest.approx(2e4 + 6e4 - 5e4)
-    assert moved[other] == pytest.approx(1.1e6)
-    assert moved[place + 1 : place + 3].tolist() == pytest.approx([0.4, 0.3])
-
-
-def test_companions_are_taken_from_all_frames():
-    start = {"flux": torch.tensor([2e5])}
-    planets = [dr.Planet.from_offset(contrast, 0.4, 0.3) for contrast in (0.1, 0.2, 0.3)]
-    frames = tuple(FrameUnknowns(("flux",), start, modes=2, amplitude_modes=1) for _ in range(2))
-    unknowns = Unknowns(frames, own=("flux",), drift=1, blocks=((0,), (1,)))
-    vector = torch.arange(unknowns.size, dtype=torch.float64)
-    more, longer = unknowns.with_companions(planets, vector)
-    fewer, shorter = more.without_companions(torch.tensor([True, False, True]), longer)
-    assert fewer.frames[1].companions == (planets[1],)
-    assert shorter[fewer.where("companions")].tolist() == pytest.approx([0.2, 0.4, 0.3])
-    again, same = fewer.without_companions(torch.tensor([True]), shorter)
-    assert again == unknowns
-    assert same.tolist() == vector.tolist()
 
 
 @pytest.mark.parametrize("contrast", [0.0, 1e-3])

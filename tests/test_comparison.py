@@ -18,8 +18,7 @@ from pyklip_diffrender.reduction import (
     in_words,
     write_comparison,
 )
-from pyklip_diffrender.reduction.several import _thumbnails, _tracks, sources_of
-from pyklip_diffrender.scene.product_headers import world_coordinates
+from pyklip_diffrender.reduction.several import sources_of
 
 MOTION = (0.28, -0.36)
 """Of AU Mic, arcsec per year."""
@@ -126,45 +125,6 @@ def test_the_page_of_epochs_links_to_each(tmp_path):
     assert content["pairs"][0]["verdict"] == "moves with the star"
     write_comparison({key: summary(59855.0, []) for key in folders}, None, tmp_path)
     assert "There are no candidates" in html.read_text(encoding="utf-8")
-
-
-def images_file(path):
-    """The part of images.fits that the comparison shows."""
-    y, x = np.mgrid[-4:5, -4:5]
-    grid = 0.2 * np.stack([x, y], axis=-1)
-    observation = dr.Observation.from_arrays(
-        np.ones((9, 9)), np.ones((9, 9)), pixelscale=0.2, center=(4.0, 4.0), position_angles=0.0
-    )
-    snr = fits.ImageHDU(1.0 * x, world_coordinates(grid, observation), "SNR")
-    path.parent.mkdir()
-    fits.HDUList([fits.PrimaryHDU(), snr]).writeto(path)
-
-
-def test_the_page_has_thumbnails_and_the_track_of_a_background_star(tmp_path):
-    first, second = summary(59855.0, [(0.6, -0.2)]), summary(60280.0, [(0.3, 0.2), (2.0, 2.0)])
-    folders = {"a": first, "b": second}
-    images_file(tmp_path / "a" / "images.fits")
-    text = write_comparison(folders, MOTION, tmp_path)[0].read_text(encoding="utf-8")
-    # The folder b has no products; there is one candidate at the first epoch.
-    assert text.count('<img src="data:image/png;base64,iVBOR') == 2
-    (thumbnail,) = _thumbnails(folders, tmp_path)
-    ax = thumbnail.figure.axes[0]
-    left, right, bottom, top = ax.images[0].get_extent()
-    assert [left, right, bottom, top] == pytest.approx([-0.9, 0.9, -0.9, 0.9])
-    (circles,) = (line for line in ax.lines if line.get_label() == "companions")
-    # East is left.
-    np.testing.assert_allclose(np.ravel(circles.get_data()), [-0.6, -0.2])
-    (track,) = _tracks([first, second], MOTION)
-    (way,) = (each for each in track.figure.axes[0].lines if "background" in each.get_label())
-    years = 425 / 365.25
-    expected = [[0.6, -0.2], [0.6 - MOTION[0] * years, -0.2 - MOTION[1] * years]]
-    np.testing.assert_allclose(np.stack(way.get_data(), axis=1), expected)
-    limits = track.figure.axes[0].get_xlim()
-    assert limits[0] > limits[1]
-    # Without a proper motion, a second epoch, or a candidate there is none.
-    assert _tracks([first, second], None) == []
-    assert _tracks([first, summary(59856.0, [], filter="F210M")], MOTION) == []
-    assert _tracks([summary(59855.0, []), summary(60280.0, [])], MOTION) == []
 
 
 def test_the_page_has_a_table_of_candidates_over_filters(tmp_path):

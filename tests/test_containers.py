@@ -26,8 +26,6 @@ VALUES = np.arange(1.0, 13.0).reshape(3, 4)
 MASK = VALUES % 5 == 0
 SURFACE = u.MJy / u.sr
 
-Unit = u.UnitBase | None
-
 
 def quantity(values, mask, unit):
     values = values if mask is None else Masked(values, mask=mask)

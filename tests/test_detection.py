@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import logging
 import math
 from dataclasses import dataclass, field, replace
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection
-from pyklip_diffrender.detection.candidates import calibration_errors, with_companions
+from pyklip_diffrender.detection.candidates import with_companions
 from pyklip_diffrender.errors import (
     CorruptFileError,
     IncompatibleSetupError,
@@ -158,18 +157,6 @@ def test_the_freedom_of_the_wavefront_costs_something_everywhere(empty):
     assert 1.02 < np.median(ratio[seen]) < 2.0
 
 
-def test_ignoring_the_wavefront_would_be_noticed(world):
-    """What the calibration tests are there for: errors of a known star are far too small."""
-    fit = world.fitted(0)
-    frozen = replace(fit.linear, deviation=1e-6 * torch.ones_like(fit.linear.deviation))
-    outdated = FLUX * world.model(world.opd).numpy()
-    residual = torch.from_numpy(fit.frames[0].observation.data[0] - outdated)
-    part = replace(frozen.frames[0], residual=residual)
-    frozen = replace(frozen, frames=(part,), vector=frozen.mean)
-    found = dr.detect(replace(fit, stored_linear=frozen), threshold=math.inf)
-    assert found.snr[radius(found) > 0.25].std() > 1.5
-
-
 FEW = JointBasis([SegmentMotions(), FourierModes(4)])
 
 
@@ -223,19 +210,6 @@ def test_contrast_and_place_of_planets_are_unbiased_and_their_errors_right():
         assert 1 / within < drawn.std() < within
 
 
-def test_the_subtracted_frame_has_lost_light_that_the_measurement_has_not(world):
-    # Too near for the fit to look for it by itself.
-    planet = Planet(1e-5, 0.33, 60.0)
-    fit = world.fitted(7, planet)
-    assert not len(fit.companions)
-    light = world.expected(planet) - world.expected()
-    weight = light / fit.frames[0].observation.error[0] ** 2
-    kept = float((weight * fit.frames[0].residual[0]).sum() / (weight * light).sum())
-    measured = float(dr.measure(fit, [planet.offset])["contrast"][0]) / 1e-5
-    assert kept < 0.9
-    assert measured == pytest.approx(1.0, abs=0.2)
-
-
 @pytest.mark.parametrize(
     ("size", "contrast"),
     [
@@ -257,36 +231,12 @@ def test_a_bright_companion_gets_parameters_of_its_own(request, size, contrast):
     assert fit.frames[0].star == pytest.approx(world.expected(), rel=0.02, abs=100)
 
 
-@pytest.mark.parametrize(
-    ("contrast", "seed", "again"),
-    [(4e-6, 7, False), pytest.param(1e-5, 11, True, marks=pytest.mark.slow)],
-)
-def test_only_what_bends_the_wavefront_far_has_it_fitted_anew(world, contrast, seed, again):
-    fit = world.fitted(seed, replace(WHERE, contrast=contrast))
-    assert len(fit.companions) == 1
-    before_wavefront = itertools.takewhile(lambda record: not record["wavefront"], fit.history)
-    first = len(list(before_wavefront))
-    alignments = [record for record in fit.history[first:] if not record["wavefront"]]
-    assert alignments  # A new companion's position is fitted first, with the wavefront held.
-    assert any(record["kappa"] > 0.01 for record in alignments) == again
-
-
 @pytest.mark.slow
 def test_what_a_fit_took_for_a_companion_need_not_be_one(world):
     observation = world.observed(world.expected(), 4)
     fit = world.refined(observation, companions=(replace(WHERE, contrast=1e-6),))
     assert len(fit.companions) == 1
     assert len(dr.detect(fit).candidates) == 0
-
-
-def test_a_prior_that_is_held_too_narrow_is_noticed(world):
-    observation = world.observed(world.expected(), 4)
-    scales = world.fitted(4).scales
-    for factor, status in ((1.0, Status.CONVERGED), (1 / 3, Status.PRIOR_MISMATCH)):
-        held = WavefrontPrior({k: factor * v for k, v in scales.items()}, fit_scales=False)
-        fit = world.refined(observation, prior=held)
-        assert fit.status is status
-        assert fit.status.calibrated == (factor == 1.0)
 
 
 def test_a_prior_that_is_held_too_narrow_is_widened(world):
@@ -421,13 +371,6 @@ def test_the_planet_is_gone_from_the_map_without_candidates(one):
     assert np.abs(one.residual_snr[near]).max() < 3.5
 
 
-def test_measuring_at_a_pixel_gives_the_maps_value(one):
-    row, column = 27, 9
-    table = one.measure(one.grid[row, column])
-    assert float(table["contrast"][0]) == pytest.approx(one.contrast[row, column], rel=1e-3)
-    assert float(table["contrast_error"][0]) == pytest.approx(one.error[row, column], rel=1e-4)
-
-
 def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world):
     """A contrast is relative to the star's light; whether there is a source at all is not."""
     fit = world.fitted(5, FAINT)
@@ -475,19 +418,6 @@ def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large):
 
 
 @pytest.mark.slow
-def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(world):
-    known = replace(world, opd=world.later)
-    found = dr.detect(known.fitted(14, replace(WHERE, contrast=9e-5), wavefront=False))
-    fit, row = found.fits[0], found.candidates[0]
-    relative = found.scatter * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
-    expected = math.hypot(relative * row["contrast"], own_error(found))
-    assert row["snr"] > 400
-    assert row["contrast_error"] == pytest.approx(expected, rel=1e-4)
-    assert row["contrast_error"] > 1.001 * own_error(found)
-    assert abs(row["contrast"] - 9e-5) < 4 * expected
-
-
-@pytest.mark.slow
 def test_errors_of_a_companion_in_the_derivatives_count_star_and_image_once(large):
     found = large.detected(7, replace(WHERE, contrast=1e-3))
     (row,) = found.candidates
@@ -499,35 +429,6 @@ def test_errors_of_a_companion_in_the_derivatives_count_star_and_image_once(larg
     known = float(found.photon_error[np.unravel_index(distance.argmin(), distance.shape)])
     assert row["contrast_error"] > 1.2 * known
     assert abs(row["contrast"] - 1e-3) < 4 * row["contrast_error"]
-
-
-def test_what_flux_and_image_do_to_a_contrast_may_cancel(world, one):
-    (linear, templates), offset = one.groups[0], torch.tensor([WHERE.offset], dtype=torch.float64)
-    flux, mode = (
-        linear.unknowns.index(Unknown("flux", 0)),
-        linear.unknowns.index(Unknown("modes", 40)),
-    )
-    seen = templates.image(0, offset[0]) * linear.frames[0].weight ** 2
-    mode_40 = 1e-9 * torch.eye(len(world.basis)).double()[40]
-    nanometre = world.basis.opd(mode_40, PupilGrid.full(world.model.npix))
-    more, less = (templates.image(0, offset[0], step * nanometre) for step in (0.5, -0.5))
-    slope = (seen * (more - less)).sum() / (seen * templates.image(0, offset[0])).sum()
-    changes = torch.zeros(len(linear.unknowns), dtype=torch.float64)
-    changes[flux], changes[mode] = 1 / one.fits[0].frames[0].values["flux"][0], slope
-    deviation = torch.full_like(linear.deviation, 1e-12)
-    deviation[[flux, mode]] = 1e-3 / changes[[flux, mode]].abs()
-
-    def error(curvature, frames=1):
-        known = replace(linear, deviation=deviation, curvature=curvature)
-        groups = [(known, templates)] * frames
-        ones = torch.ones(1, dtype=torch.float64)
-        errors = calibration_errors(groups, offset, 1e3 * ones, 3 * ones)
-        return float(errors[0]) / 3
-
-    untied, tied = torch.zeros_like(linear.curvature), 1e14 * torch.outer(changes, changes)
-    assert error(untied) == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-5)
-    assert error(untied, frames=2) == pytest.approx(1e-3, rel=1e-5)
-    assert error(tied) < 1e-6
 
 
 def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_extended(
@@ -678,18 +579,6 @@ def test_dithered_frames_have_star_positions_of_their_own(world):
     np.testing.assert_array_equal(first.values["lyot_shift"], second.values["lyot_shift"])
 
 
-def test_the_errors_of_frames_fitted_together_are_their_own(world):
-    first, second = (world.observed(world.expected(), 55 + k) for k in range(2))
-    noisy = replace(second, error=3 * second.error)
-    quiet, other = world.refined([first, noisy]).frames
-    apart = {name: noisier / quiet.errors[name] for name, noisier in other.errors.items()}
-    # Hardly anything else says what the background is; all say what the wavefront is, and with it
-    # where the star is.
-    assert apart["background"][0] == pytest.approx(2.9, abs=0.2)
-    assert (apart["star_offset"] > 1.005).all()
-    np.testing.assert_array_equal(apart["lyot_shift"], 1.0)
-
-
 def test_snapshots_may_drift_apart_by_what_the_prior_allows(world):
     generator = torch.Generator().manual_seed(8)
     change = torch.zeros(len(world.basis), dtype=torch.float64)
@@ -719,13 +608,6 @@ def test_the_contrast_curve_is_five_times_the_error_of_the_map(world, empty):
     for row in quick:
         k = int(np.argmin(np.abs(table["separation"] - row["separation"])))
         assert row["contrast"] == pytest.approx(table["contrast"][k], rel=1e-6)
-
-
-def test_companions_do_not_raise_the_contrast_curve(one):
-    assert len(one.fits[0].companions) == 1
-    by_itself = dr.contrast_curve(one.fits[0], [0.5])
-    given = dr.contrast_curve(one.fits[0], [0.5], scatter=one.scatter)
-    np.testing.assert_allclose(by_itself["contrast"], given["contrast"], rtol=1e-3)
 
 
 def test_products_can_be_read_by_others(one, tmp_path):
@@ -842,15 +724,6 @@ def test_a_detection_from_a_file_measures_with_its_fit(world, one, tmp_path):
             np.testing.assert_array_equal(table[name], expected[name])
 
 
-@pytest.mark.parametrize("percent", [25, 50, 99])
-def test_part_of_a_file_is_no_detection(empty, percent, tmp_path):
-    path = empty[0].write(tmp_path)[0]
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    with pytest.raises(CorruptFileError, match=r"detection\.fits"):
-        Detection.read(path)
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [("FACTS", "no FACTS"), ("PHOTON_ERROR", "PHOTON_ERROR"), ("SNR", "shapes"), ("none", "such")],
@@ -915,52 +788,10 @@ def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world):
     assert difference[radius(found) > 0.25].std() < 0.05
 
 
-@pytest.mark.slow
-def test_a_companion_that_one_fit_knows_is_given_to_the_others(large):
-    planet = replace(WHERE, contrast=7e-6)
-    shots = [large.observed(large.expected(planet), 80 + k) for k in (0, 1)]
-    fits = [
-        large.refined(shots[0], companions=(planet,), **NOT_LOOKING),
-        large.refined(shots[1], **NOT_LOOKING),
-    ]
-    assert [len(fit.companions) for fit in fits] == [1, 0]
-    found = dr.detect(fits)
-    assert [len(fit.companions) for fit in found.fits] == [1, 1]
-
-
-@pytest.mark.slow
-def test_a_companion_that_is_none_is_given_to_no_fit(large):
-    planet = replace(WHERE, contrast=2e-5)
-    nothing = Planet(0.0, 0.9, 250.0)
-    fit = large.refined(large.observed(large.expected(planet), 80), companions=(planet, nothing))
-    assert len(fit.companions) == 2
-    found = dr.detect(fit)
-    assert len(found.sources) == len(found.fits[0].companions) == 1
-
-
 @pytest.fixture(scope="module")
 def reference(large):
     """A brighter star, fitted on its own."""
     return large.refined(replace(large.observed(4 * large.expected(), 72), reference=True))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, NOT_LOOKING], ids=["looking", "not looking"])
-def test_a_reference_star_on_its_own_stays_as_it_was_fitted(large, reference, options):
-    target = large.fitted(7, replace(WHERE, contrast=2e-5), **options)
-    found = dr.detect([target, reference])
-    assert len(found.fits[0].companions) == len(found.sources) == 1
-    assert found.fits[1] is reference
-    # What the fit has found by itself needs no second one.
-    assert [len(target.companions), found.fits[0] is target] == [int(not options), not options]
-
-
-def test_without_candidates_a_frame_is_left_as_the_fit_left_it(empty):
-    fit = empty[0].fits[0]
-    difference = (empty[0].subtracted[0] - fit.frames[0].residual[0]) / fit.frames[
-        0
-    ].observation.error[0]
-    assert difference.std() < 0.05
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ import pytest
 import scipy.ndimage
 import torch
 from astropy.convolution import convolve
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from pyklip_diffrender.bridges.sampled_planes import SplineRotation
@@ -19,8 +18,6 @@ from pyklip_diffrender.optics import (
     LinearResampling,
     PixelCrosstalk,
 )
-
-Array = NDArray[np.float64]
 
 SHAPE = (24, 31)
 KERNEL = np.array([[0.01, 0.02, 0.03], [0.04, 0.8, 0.05], [0.06, 0.07, 0.08]])

@@ -11,19 +11,15 @@ import poppy
 import pytest
 import torch
 from device_work import QUICK, SIZE, fitted, frame, model_on, opd, reached, settings
-from numpy.typing import NDArray
 from pretend_device import DEVICE, pretended
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.bridges import from_poppy
 from pyklip_diffrender.bridges.sampled_planes import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
-from pyklip_diffrender.linear import jacobian
 from pyklip_diffrender.optics import GaussianBlur, LinearResampling, PixelCrosstalk
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene import Systematics
-
-Array = NDArray[np.float64]
 
 
 def agree(compute, rtol):
@@ -33,41 +29,6 @@ def agree(compute, rtol):
         got = compute(DEVICE)
     for ours, theirs in zip(got, expected, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=rtol * np.abs(theirs).max())
-
-
-@pytest.mark.parametrize(
-    "mistake",
-    [
-        lambda there, here: there + here,
-        lambda there, here: here.mul_(there),
-        lambda there, here: there[0] * here,
-        lambda there, here: torch.stack([there, here]),
-        lambda there, here: torch.where(there > 0, there, here),
-        lambda there, here: here[there.long()],
-        lambda there, here: torch.zeros_like(there) + torch.zeros(3, device=here.device),
-        lambda there, here: there.numpy(),
-        lambda there, here: np.asarray(there),
-        lambda there, here: jacobian(lambda x: [x * here], there),
-    ],
-)
-def test_the_pretended_device_refuses_to_mix(mistake):
-    with pretended():
-        there, here = torch.ones(3, device=DEVICE), torch.ones(3)
-        with pytest.raises((RuntimeError, TypeError), match=r"one device|\.cpu\(\)"):
-            mistake(there, here)
-
-
-def test_the_pretended_device_follows_data():
-    with pretended():
-        here = torch.linspace(0, 1, 3, requires_grad=True)
-        there = here.to(DEVICE)
-        assert (2 * there[torch.tensor([0, 1])]).device == DEVICE
-        assert torch.as_tensor([1.0], device=DEVICE).device == DEVICE
-        assert there.detach().cpu().numpy().shape == (3,)
-        (there * torch.ones(3, device=DEVICE)).sum().backward()
-        assert here.grad.device == here.device != DEVICE
-        (slope,) = jacobian(lambda x: [torch.sin(x)], there)
-        assert slope.device == DEVICE
 
 
 @pytest.mark.parametrize(

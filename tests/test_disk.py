@@ -166,25 +166,6 @@ def test_non_negative_light_is_that_of_scipy():
     assert gain == pytest.approx((data**2).sum() - ((data - columns @ expected) ** 2).sum())
 
 
-def test_the_threshold_is_in_standard_deviations():
-    """Sources that do not touch lose one standard deviation each, and those below it are dark."""
-    information = np.array([1.0, 4.0, 100.0])
-    light = np.array([3.0, 0.4, 0.5])
-    solved = module._brightest(np.diag(information), information * light, np.zeros(3))
-    np.testing.assert_allclose(solved, [2.0, 0.0, 0.4], atol=1e-5)
-
-
-def test_gains_are_with_respect_to_sources_on_the_same_pixels():
-    """So that a fit that repeats them gains nothing."""
-    fit = small_fit()
-    pixels = module._positions(fit.frames[0].grid, 0.30)
-    first = module._fit_sources(fit, pixels)
-    assert first.gain > 10
-    again = module._fit_sources(fit, pixels, replace(first, light={0: np.zeros((24, 24))}))
-    assert again.gain == pytest.approx(0, abs=1e-3)
-    assert again.contrasts == pytest.approx(first.contrasts, rel=0.01, abs=1e-8)
-
-
 def planets_in(frames, places, contrast):
     """The frames with planets at x, y from the star in the first of them, arcsec."""
     ((_, templates),) = groups_of([fitted()[1].fit])

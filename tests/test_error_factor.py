@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import gaussian_filter
 
@@ -18,7 +17,6 @@ SMOOTH = 1.1
 """Standard deviation of the Gaussian that makes noise as smooth as a map of S/N, pixels."""
 
 NOTHING = np.zeros((0, 2))
-Image = NDArray[np.float64]
 
 
 def field(size=80):
@@ -78,14 +76,6 @@ def test_the_factor_is_the_scatter_of_the_snr(scale):
     assert (np.std(logs, axis=0) < 1.5 * stated).all()
     assert stated[0] < 0.2
     assert stated[-1] < 0.06
-
-
-def test_a_factor_by_separation_alone_would_miss_the_spikes():
-    scale = np.sqrt(0.5 + 5 * STARLIGHT / 50)
-    factor = significance().factor(scale * noise(1), NOTHING).factors
-    ring = np.abs(DISTANCE - 0.6) < 0.06
-    assert scale[ring].max() > 1.6 * scale[ring].min()
-    assert np.corrcoef(factor[ring], scale[ring])[0, 1] > 0.95
 
 
 def test_sources_do_not_raise_the_factor():
@@ -192,8 +182,3 @@ def test_noise_exceeds_the_threshold_as_rarely_as_gaussian_noise():
     assert exceeded == pytest.approx(stats.norm.sf(3.0), rel=0.15)
     known = ErrorFactor.constant(1.5)
     np.testing.assert_allclose(known.threshold(3.0, offsets), 3.0)
-
-
-def test_a_map_without_valid_pixels_needs_no_factor():
-    factor = significance().factor(np.full((80, 80), np.nan), NOTHING)
-    assert not factor.is_needed

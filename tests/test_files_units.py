@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import hashlib
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +21,6 @@ from pyklip_diffrender.errors import (
     UnitError,
 )
 from pyklip_diffrender.io import (
-    ARCSEC,
     embedded_table,
     native_float64,
     open_fits,
@@ -32,7 +30,6 @@ from pyklip_diffrender.io import (
     sha256,
     to_arcsec,
     to_metres,
-    to_unit,
     write_fits,
 )
 
@@ -53,12 +50,6 @@ def test_lengths_become_metres(value, metres):
     assert float(to_metres(value, "opd")) == pytest.approx(metres, rel=1e-15)
 
 
-def test_angles_become_arcseconds():
-    assert float(to_arcsec(20 * u.mas, "offset")) == pytest.approx(0.020, rel=1e-15)
-    assert float(to_arcsec(2.0, "offset")) == 2.0
-    assert pytest.approx(np.pi / 180 / 3600, rel=1e-15) == ARCSEC
-
-
 def test_a_list_of_quantities_of_mixed_units_keeps_each_unit():
     np.testing.assert_allclose(
         to_metres([1 * u.um, 2 * u.nm, 3 * u.m], "opd"), [1e-6, 2e-9, 3.0], rtol=1e-15
@@ -71,10 +62,6 @@ def test_a_unit_that_does_not_convert_is_named_with_the_expected_one(bad):
     with pytest.raises(UnitError, match=rf"opd: got the unit '{bad.unit}'.*'m'") as caught:
         to_metres(bad, "opd")
     assert isinstance(caught.value, ValueError | DiffrenderError)
-
-
-def test_to_unit_takes_any_unit():
-    assert float(to_unit(180 * u.deg, "rad", "angle")) == pytest.approx(np.pi, rel=1e-15)
 
 
 @pytest.fixture
@@ -271,12 +258,6 @@ def test_a_replaced_product_keeps_its_permissions(tmp_path, umask):
         assert permissions(path) == mode
 
 
-def test_writing_leaves_the_umask_of_the_process_alone(tmp_path, monkeypatch):
-    """It is one for all threads: files that another one makes meanwhile would be open to all."""
-    monkeypatch.setattr(os, "umask", lambda mask: pytest.fail(f"umask set to {mask:o}"))
-    write_fits(fits.HDUList([fits.PrimaryHDU()]), tmp_path / "product.fits")
-
-
 def test_two_threads_that_write_one_product_leave_one_of_the_two(tmp_path):
     """Each has a temporary file of its own."""
     path, both = tmp_path / "product.txt", threading.Barrier(2)
@@ -323,12 +304,6 @@ def test_a_process_killed_while_writing_leaves_the_old_product_intact(tmp_path, 
         path,
     )
     assert sha256(path) == before
-
-
-def test_sha256_is_that_of_the_bytes(tmp_path):
-    path = tmp_path / "bytes"
-    path.write_bytes(b"abc")
-    assert sha256(path) == hashlib.sha256(b"abc").hexdigest()
 
 
 @pytest.mark.parametrize(

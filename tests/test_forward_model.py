@@ -9,7 +9,6 @@ import pytest
 import torch
 from astropy.io import fits
 from backend_scene import OPD, frames, generic, render
-from numpy.typing import NDArray
 from pyklip import fm
 from pyklip.fmlib.fmpsf import FMPlanetPSF
 from pyklip.fmlib.nofm import NoFM
@@ -24,8 +23,6 @@ from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, regist
 from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.scene import Planet
 from pyklip_diffrender.wavefront import default_basis, random_drift, random_opd
-
-Image = NDArray[np.float64]
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning"),
@@ -212,14 +209,6 @@ def test_errors_include_the_scatter_of_the_search(model, tmp_path, monkeypatch):
     for name in ("DRFMFERR", "DRFMRAER", "DRFMDEER"):
         assert headers[1][name] == pytest.approx(3 * headers[0][name], rel=0.02)
     assert headers[1]["DRFMFLUX"] == headers[0]["DRFMFLUX"]
-
-
-@pytest.mark.usefixtures("registered")
-def test_no_planet_no_values(model, tmp_path):
-    star, planet = shots(model, OLD.data)
-    made = dataset(star - planet, model, np.sqrt(star))
-    modelled(made, planet_psf(OLD.data, made), tmp_path, algo="diffrender")
-    assert "DRFMFLUX" not in fits.getheader(tmp_path / "x-klipped-KLmodes-all.fits")
 
 
 @pytest.mark.slow

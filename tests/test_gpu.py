@@ -9,9 +9,6 @@ import device_work as work
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 pytestmark = [
     pytest.mark.gpu,

@@ -93,17 +93,6 @@ def test_an_opd_with_absorption_and_none_at_all(opd):
     assert worst(system(), None, PIXELS) < 1e-5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sampling", [1.2, 3.0, 6.0])
-def test_finer_cells_give_the_same_templates(sampling, opd):
-    """One, two and three cells a pixel: the inverse transform of a folded spectrum."""
-    model = system(fov_pixels=(31, 33), **SIAF)
-    exact = system(fov_pixels=(31, 33), occulter_sampling=12.0, **SIAF)(opd)
-    image = PointSources(model, opd, sampling=sampling).images([15], [16])[0]
-    # Single precision of the result.
-    assert float((image - exact).abs().max() / exact.max()) < 2e-7
-
-
 def test_all_pixels_at_once_are_the_pixels_one_by_one(opd):
     model = system(fov_pixels=(12, 11))
     sources = PointSources(model, opd)
@@ -168,17 +157,6 @@ def test_bad_pixels_and_maps_are_refused(opd):
         PointSources(system(), torch.stack([opd, opd]))
     with pytest.raises(TypeError, match="lyot_shift"):
         PointSources(system(), opd, {"lyot_shfit": (0, 0)})
-
-
-@pytest.mark.slow
-def test_templates_at_full_size():
-    """1024 samples, sheared pixels: from the axis to 1, 2 and 3.5 arcsec from it."""
-    model = nircam_coronagraph(monochromatic=WAVELENGTH, **SIAF)
-    opd = torch.from_numpy(random_opd(7).data)
-    assert worst(model, opd, [(40, 40), (44, 41), (33, 46), (50, 52)]) < 3e-6
-    # Beyond the reach of the mask, the latter.
-    assert worst(model, opd, [(60, 65)]) < 3e-6
-    assert 3e-6 < worst(model, opd, [(0, 79)]) < 1e-3
 
 
 def both_routes(**changes):
@@ -268,12 +246,6 @@ def test_a_model_keeps_nothing_of_a_transform(opd):
     assert torch.equal(model(opd), image)
     # What a transform has wrapped cannot be pickled.
     assert torch.equal(pickle.loads(pickle.dumps(model))(opd), image)
-
-
-def test_single_precision_by_convolution(opd):
-    exact, single = system()(opd), system(dtype=torch.float32)(opd)
-    assert single.dtype == torch.float32
-    assert float((single - exact).abs().max() / exact.max()) < 1e-4
 
 
 def test_the_route_can_be_chosen():

@@ -10,7 +10,6 @@ import torch
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints
-from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.pattern import MeasuredPattern, choose_systematics, package_library
 from pyklip_diffrender.pyklip_backend.klip_call import check_settings
@@ -231,15 +230,6 @@ def test_a_folder_of_libraries_is_a_choice_of_systematics(tmp_path):
     check_settings(dr.DiffrenderSettings(systematics=tmp_path / "own"))
     with pytest.raises(IncompatibleSetupError, match=r"systematics: got .*nowhere"):
         check_settings(dr.DiffrenderSettings(systematics=tmp_path / "nowhere"))
-
-
-def test_the_command_says_what_is_missing(tmp_path, capsys):
-    output = ["-o", str(tmp_path / "patterns.fits"), "--opd", "flat"]
-    assert main(["learn", *output]) == 2
-    assert "Missing argument 'FRAMES...'" in capsys.readouterr().err
-    (tmp_path / "patterns.fits").touch()
-    assert main(["learn", str(tmp_path), *output]) == 1
-    assert "--overwrite" in capsys.readouterr().err
 
 
 @pytest.mark.slow

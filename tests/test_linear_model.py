@@ -12,7 +12,6 @@ from pyklip_diffrender.linear.model import LinearFrame, LinearModel, Unknown
 
 NY, NX = 6, 7
 SHARED, DRIFT = 6, 2
-NONE = torch.zeros(0, dtype=torch.int64)
 
 
 def random(*shape, seed):
@@ -142,17 +141,6 @@ def test_the_noise_is_that_of_the_full_covariance(patterned):
     assert chi2 < 0.8 * float((white[0] ** 2).sum())
 
 
-def test_the_covariance_of_a_shared_pattern_is_the_one_that_is_written_down(patterned):
-    """C from its definition, g^2 s_a s_b between frames, in one pixel."""
-    star = torch.stack([3 * random(NY, NX, seed=60 + k).abs() for k in range(2)])
-    width = 0.1 + random(NY, NX, seed=62).abs()
-    matrix, place = noise(patterned), 3 * NX + 4
-    a, b = (part.weight[3, 4] for part in patterned.frames)
-    expected = width[3, 4] ** 2 * a * star[0, 3, 4] * b * star[1, 3, 4]
-    torch.testing.assert_close(matrix[place, NY * NX + place], expected)
-    assert float(expected) > 0.1
-
-
 def stacked(model, templates):
     """Whitened templates over all frames, (k, pixels)."""
     count = len(next(iter(templates.values())))
@@ -263,8 +251,3 @@ def test_unknowns_can_be_taken_out_and_their_light_put_back(pair):
 def test_frames_must_agree_on_the_number_of_templates(pair):
     with pytest.raises(ShapeError, match="one number"):
         pair.weigh({0: random(2, NY, NX, seed=1), 1: random(3, NY, NX, seed=2)})
-
-
-def test_unknowns_say_whose_they_are():
-    assert str(Unknown("star_offset", 1, 2)) == "star_offset[1] of frame 2"
-    assert str(Unknown("modes", 7)) == "modes[7]"

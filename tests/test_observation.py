@@ -113,12 +113,6 @@ def test_without_quality_only_nan_is_masked_and_that_is_said(tmp_path, frames):
     assert np.argwhere(~got.valid).tolist() == [[0, 1, 2]]
 
 
-def test_a_single_frame_is_a_stack_of_one(tmp_path, frames):
-    got = Observation.from_fits(calints(tmp_path / "cal.fits", frames[0]))
-    np.testing.assert_array_equal(got.data, frames[:1])
-    assert got.position_angles.shape == (1,)
-
-
 @pytest.mark.hard
 def test_scaled_integers_equal_their_values(tmp_path, frames):
     counts = np.round(frames * 100).astype(np.int16)
@@ -129,18 +123,6 @@ def test_scaled_integers_equal_their_values(tmp_path, frames):
     np.testing.assert_array_equal(Observation.from_fits(path).data, counts * 0.25 + 3.0)
 
 
-@pytest.mark.hard
-@pytest.mark.parametrize("percent", [25, 50, 99])
-@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
-def test_a_truncated_file_is_an_error_that_names_it(tmp_path, frames, suffix, percent):
-    # Nothing compresses worse than a file that does: long runs make early ends of streams.
-    path = calints(tmp_path / f"cut{suffix}", np.tile(frames, (1, 8, 8)))
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    with pytest.raises(CorruptFileError, match=r"cut\.fits"):
-        Observation.from_fits(path)
-
-
 @pytest.mark.parametrize("name", ["SCI", "ERR"])
 def test_a_missing_extension_is_named(tmp_path, frames, name):
     path = calints(tmp_path / "part.fits", frames, leave_out=(name,))
@@ -148,21 +130,11 @@ def test_a_missing_extension_is_named(tmp_path, frames, name):
         Observation.from_fits(path)
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(CorruptFileError, match=r"nowhere\.fits"):
-        Observation.from_fits(tmp_path / "nowhere.fits")
-
-
 @pytest.mark.parametrize("unit", [None, "", "parsnips"])
 def test_a_missing_or_unknown_unit_is_an_error(tmp_path, frames, unit):
     path = calints(tmp_path / "unit.fits", frames, BUNIT=unit)
     with pytest.raises(UnitError, match=r"unit\.fits.*(BUNIT|parsnips).*MJy/sr"):
         Observation.from_fits(path)
-
-
-def test_a_missing_pixel_area_is_an_error(tmp_path, frames):
-    with pytest.raises(UnitError, match=r"area\.fits.*PIXAR_A2"):
-        Observation.from_fits(calints(tmp_path / "area.fits", frames, PIXAR_A2=None))
 
 
 def test_an_integration_without_a_good_pixel_is_left_out_and_named(tmp_path, frames):
@@ -219,14 +191,6 @@ def test_bad_pixels_become_zero_in_the_copy_only(frames):
     assert (got.error[0, 0, 1:7] == 1).all()
 
 
-def test_masked_arrays_mask(frames):
-    mask = np.zeros(frames.shape, dtype=bool)
-    mask[1, 3, 4] = True
-    masked = np.ma.masked_array(frames, mask)
-    got = Observation.from_arrays(masked, np.ones(frames.shape), pixelscale=0.06)
-    np.testing.assert_array_equal(got.valid, ~mask)
-
-
 @pytest.mark.parametrize(
     "shape", [(0, 8, 10), (8,), (1, 2, 8, 10), (2, 0, 10)], ids=["none", "1d", "4d", "no rows"]
 )
@@ -248,18 +212,6 @@ def test_arrays_that_do_not_go_together_are_refused(frames):
         Observation.from_arrays(frames, ones, pixelscale=(0.06, 0.06, 0.06))
     with pytest.raises(UnitError, match="parsnips"):
         Observation.from_arrays(frames, ones, unit="parsnips", pixelscale=0.06)
-
-
-def test_quantities_are_converted_or_refused(frames):
-    ones = np.ones(frames.shape)
-    got = Observation.from_arrays(
-        frames * u.Jy / u.sr, ones * u.mJy / u.sr, unit="MJy/sr", pixelscale=62.4 * u.mas
-    )
-    np.testing.assert_allclose(got.data, frames * 1e-6, rtol=1e-6)
-    np.testing.assert_allclose(got.error, 1e-9, rtol=1e-6)
-    assert got.pixelscale == pytest.approx((0.0624, 0.0624), rel=1e-12)
-    with pytest.raises(UnitError, match="data"):
-        Observation.from_arrays(frames * u.s, ones, unit="photon", pixelscale=0.06)
 
 
 def test_a_cutout_is_whole_pixels_about_the_star(frames):
@@ -314,12 +266,6 @@ def test_the_mean_of_faint_frames_is_not_biased():
     # 400 pixels: the mean of the pulls scatters by 0.05.
     assert abs(pulls.mean()) < 0.15
     assert 0.9 < pulls.std() < 1.1
-
-
-def test_combined_of_one_frame_is_that_frame(frames):
-    one = Observation.from_arrays(frames[0], frames[0] + 1, pixelscale=0.06)
-    np.testing.assert_allclose(one.combined().data, one.data, rtol=1e-14)
-    np.testing.assert_allclose(one.combined().error, one.error, rtol=1e-14)
 
 
 def test_the_real_frames_are_read(shared_data):

@@ -68,16 +68,6 @@ def test_files_in_any_unit_give_the_same_metres(tmp_path, opd, unit, size):
     np.testing.assert_allclose(got.data, opd, rtol=1e-14, atol=1e-24)
 
 
-@pytest.mark.hard
-def test_quantities_in_any_unit_give_the_same_image(opd):
-    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=12)
-    expected = model(opd)
-    for value in (opd * u.m, opd * 1e6 * u.um, opd * 1e9 * u.nm):
-        torch.testing.assert_close(model(value), expected, rtol=1e-9, atol=1e-20)
-        torch.testing.assert_close(model(as_opd_map(value).data), expected, rtol=1e-9, atol=1e-20)
-    assert not torch.allclose(model(opd * 1.01), expected, rtol=1e-3, atol=0)
-
-
 def test_a_file_without_a_unit_asks_for_one_and_takes_it(tmp_path, opd):
     path = write(tmp_path / "wss.fits", opd * 1e6, None)
     with pytest.raises(UnitError, match=r"wss\.fits.*BUNIT.*unit='m'.*'um', 'nm'"):
@@ -114,10 +104,6 @@ def test_an_implausible_rms_warns_and_names_the_unit_that_would_do(
         np.testing.assert_allclose(got.data, opd * size, rtol=1e-15)
 
 
-def test_a_flat_wavefront_is_plausible():
-    assert not as_opd_map(np.zeros((NPIX, NPIX))).data.any()
-
-
 def test_flat_stands_for_a_flat_wavefront(tmp_path, monkeypatch):
     # A folder of that name does not change it.
     (tmp_path / "flat").mkdir()
@@ -150,18 +136,6 @@ def test_nan_outside_the_pupil_becomes_zero(tmp_path, opd, pupil):
     for got in (as_opd_map(holes), read_opd(write(tmp_path / "outside.fits", holes))):
         np.testing.assert_array_equal(got.data[pupil], opd[pupil])
         assert not got.data[~pupil].any()
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("percent", [25, 50, 99])
-@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
-def test_a_truncated_map_is_an_error_that_names_it(tmp_path, opd, percent, suffix):
-    path = write(tmp_path / f"map{suffix}", opd)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    for call in (read_opd, as_opd_map):
-        with pytest.raises(CorruptFileError, match=r"map\.fits"):
-            call(path)
 
 
 def test_the_first_image_is_taken_unless_another_is_named(tmp_path, opd):
@@ -222,18 +196,6 @@ def test_science_frames_are_no_map(tmp_path, shape):
         read_opd(path)
 
 
-@pytest.mark.slow
-def test_stpsfs_own_files_are_read(tmp_path):
-    """An OPD in metres in the primary HDU, with stpsf's keywords: nothing is converted."""
-    from stpsf_data import make_stpsf_data
-
-    folder = make_stpsf_data(tmp_path / "data", npix=NPIX)
-    got = read_opd(folder / "JWST_OTE_OPD_cycle1_example_2022-07-30.fits")
-    inside = jwst_pupil(NPIX).numpy() > 0.999
-    assert got.shape == (NPIX, NPIX)
-    assert 4e-8 < got.data[inside].std() < 9e-8
-
-
 def test_a_map_that_is_not_square_is_refused(tmp_path, opd):
     with pytest.raises(ShapeError, match=r"map\.fits.*\(96, 90\).*square"):
         read_opd(write(tmp_path / "map.fits", opd[:, :90]))
@@ -280,23 +242,6 @@ def test_every_kind_of_array_equals_a_float64_copy(tmp_path, opd):
     )
 
 
-def test_the_input_is_never_modified_nor_shared(opd, pupil):
-    given = np.where(pupil, opd, np.nan)
-    before = given.copy()
-    as_opd_map(given).data[:] = 1.0
-    np.testing.assert_array_equal(given, before)
-    quantity = given * 1e9 * u.nm
-    as_opd_map(quantity).data[:] = 1.0
-    np.testing.assert_array_equal(quantity.value, before * 1e9)
-
-
-def test_a_map_is_an_array_to_numpy(opd):
-    map_ = as_opd_map(opd)
-    assert map_.shape == (NPIX, NPIX)
-    np.testing.assert_array_equal(np.asarray(map_), opd)
-    assert np.asarray(map_, dtype=np.float32).dtype == np.float32
-
-
 def test_resampling_keeps_a_plane_and_its_orientation():
     coarse, fine = (PupilGrid.full(n) for n in (48, 144))
     plane = (3 * fine.x[None, :] - 2 * fine.y[:, None]).numpy()
@@ -338,10 +283,6 @@ def test_a_model_refuses_what_it_cannot_resample(tmp_path):
             model(np.zeros(shape))
     with pytest.raises(TypeError, match=r"read_opd\(path\)"):
         model(tmp_path / "map.fits")
-
-
-def test_a_map_shows_where_it_comes_from_and_not_its_values(opd):
-    assert repr(as_opd_map(opd)) == "OPDMap(date=None, name='array', aperture='')"
 
 
 def test_resampling_to_fewer_pixels_takes_means(opd):
@@ -398,10 +339,6 @@ def test_the_same_seed_gives_the_same_wavefront_at_any_sampling():
         # A mean over a pixel damps the highest of 32 cycles by a tenth; segment edges are cut.
         assert np.sqrt(np.mean((fine - coarse)[pupil] ** 2)) < 0.05 * 66e-9
         assert np.corrcoef(fine[pupil], coarse[pupil])[0, 1] > 0.998
-
-
-def test_there_is_light_nowhere_but_in_the_pupil():
-    assert not random_opd(1, npix=NPIX).data[jwst_pupil(NPIX).numpy() == 0].any()
 
 
 @pytest.mark.slow

@@ -61,12 +61,6 @@ def test_plane_waves_are_propagated_as_any_field(detector, values):
         assert difference(waves.fields(fx, fy), expected) < 1e-3
 
 
-def test_without_the_lattice_there_are_no_plane_waves():
-    model = system(route="planes")
-    wavefront, checked = start(model, {})
-    assert model.plane_waves(wavefront, checked, 3) is None
-
-
 @pytest.mark.parametrize("route", ["lattice", "planes"])
 @pytest.mark.parametrize("detector", DETECTORS)
 @pytest.mark.parametrize("values", [{}, MOVED])

@@ -6,16 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from astropy import units as u
-from astropy.table import QTable
 from matplotlib import pyplot
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import QuadMesh
 
 import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import Candidates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.scene.objects import Planet
@@ -150,27 +144,6 @@ def test_the_compass_points_where_planets_are(frames, angle):
     assert all(min(*each.xy, *each.xyann) > 0 for each in ax.texts)
 
 
-def test_without_a_position_angle_there_is_no_compass(frames):
-    assert not arrows(replace(frames[0], position_angles=None).plot())
-
-
-def test_the_frame_can_be_chosen(frames):
-    one, other = frames
-    both = replace(
-        one,
-        data=np.concatenate([one.data, other.data]),
-        error=np.concatenate([one.error, other.error]),
-        valid=np.concatenate([one.valid, other.valid]),
-        center=np.concatenate([one.center, other.center + 1.0]),
-        position_angles=np.array(ANGLES),
-    )
-    ax = both.plot(frame=1)
-    np.testing.assert_array_equal(shown(ax)[other.valid[0]], other.data[other.valid])
-    moved = place_of(one.plot(), 0, 0) - place_of(ax, 0, 0)
-    np.testing.assert_allclose(moved, both.pixelscale)
-    np.testing.assert_allclose(arrows(ax)["N"], np.sin(np.deg2rad([ANGLES[1], 90 - ANGLES[1]])))
-
-
 def test_a_system_shows_its_pupils_and_the_star(model):
     opd = random_opd(3, npix=NPIX).data
     pupil, wavefront, last, image = axes = model.plot(opd=opd)
@@ -200,12 +173,6 @@ def test_a_system_shows_its_pupils_and_the_star(model):
         "fraction of the star's light",
     ]
     assert image.images[0].norm.vmin == pytest.approx(1e-6 * float(model(opd).max()))
-
-
-def test_a_system_without_a_wavefront_is_flat(model):
-    wavefront = model.plot()[1]
-    assert np.nanmax(np.abs(shown(wavefront))) == 0
-    assert wavefront.images[0].get_clim() == (-1, 1)
 
 
 @pytest.mark.parametrize("frame", [0, 1])
@@ -258,97 +225,12 @@ def test_a_detection_shows_candidates_and_the_curve(found):
     assert right.get_ylabel() == "contrast at 5 sigma"
 
 
-def test_a_detection_without_candidates_has_no_circles(found):
-    left, right = replace(found, sources=Candidates.at([], []), false_alarm=np.zeros(0)).plot()
-    assert left.get_title(loc="left") == "0 candidates above S/N 5"
-    assert points(left, "companions").shape == (0, 2)
-    assert "candidates" not in [text.get_text() for text in right.get_legend().get_texts()]
-
-
 def test_axes_that_were_given_are_taken(fit):
     _, given = pyplot.subplots(1, 3)
     assert fit.plot(given).tolist() == given.tolist()
     assert len(pyplot.get_fignums()) == 1
     with pytest.raises(IncompatibleSetupError, match=r"got 2 axes, expected 3"):
         fit.plot(given[:2])
-
-
-def test_absorption_does_not_spoil_the_wavefront(model):
-    opd = torch.from_numpy(random_opd(3, npix=NPIX).data)
-    both = model.plot(opd=torch.complex(opd, 1e-8 * torch.ones_like(opd)))[1]
-    np.testing.assert_array_equal(shown(both), shown(model.plot(opd=opd)[1]))
-
-
-def curve_table():
-    contrast = np.array([1e-4, 2e-5, 5e-6])
-    table = QTable({"separation": [0.3, 0.6, 1.0] * u.arcsec}, meta={"sigmas": 5.0})
-    for name, factor in {"contrast": 1.0, "lowest": 0.7, "highest": 1.5, "known_star": 0.6,
-                         "small_sample": 1.2}.items():  # fmt: skip
-        table[name] = factor * contrast
-    return table
-
-
-def test_klip_is_in_view_and_nothing_hides_it():
-    klip = QTable(
-        {
-            "separation": [0.3, 0.6, 1.0] * u.arcsec, "contrast": [3e-3, 8e-5, 2e-5],
-            "small_sample": [np.inf, 1e-4, 2.2e-5],
-        },
-        meta={"label": "KLIP RDI (4 reference frames, 2 modes)"},
-    )  # fmt: skip
-    figure, ax = drawing.wide_panel()
-    candidates = QTable({"separation": [] * u.arcsec})
-    drawing.contrast_curve(
-        ax, curve_table(), candidates, small_sample=True, klip=klip, legend_below=True
-    )
-    FigureCanvasAgg(figure).draw()
-    low, high = ax.get_ylim()
-    assert low < 5e-6
-    assert high > 3e-3
-    legend = ax.get_legend()
-    box = legend.get_window_extent()
-    assert not box.overlaps(ax.get_window_extent())
-    assert figure.bbox.contains(box.x0, box.y0)
-    assert figure.bbox.contains(box.x1, box.y1)
-
-
-def test_a_contrast_has_its_magnitude_on_the_other_axis():
-    figure, ax = drawing.wide_panel()
-    drawing.contrast_curve(
-        ax, curve_table(), QTable({"separation": [] * u.arcsec}), small_sample=False
-    )
-    FigureCanvasAgg(figure).draw()
-    (right,) = ax.child_axes
-    assert right.get_ylabel() == "magnitude difference"
-    height = right.transData.transform([[0, 12.5]])[0, 1]
-    assert height == pytest.approx(ax.transData.transform([[0.3, 1e-5]])[0, 1])
-    shown = [float(label.get_text()) for label in right.get_yticklabels()]
-    assert len(shown) >= 3
-    assert np.allclose(np.diff(shown, 2), 0)
-
-
-@pytest.mark.parametrize("separations", [[0.4], [0.4, 0.6, 1.0]])
-def test_cells_of_completeness_have_the_contrasts_of_their_separation(separations):
-    """Every separation has its own contrasts, and these need not rise."""
-    strengths = np.array([2.0, 0.5, 1.0])
-    rows = [(s, k * 1e-5 / s, k / 2) for s in separations for k in strengths]
-    place, contrast, fraction = np.transpose(rows)
-    table = QTable({"separation": place * u.arcsec, "contrast": contrast, "completeness": fraction})
-    figure, ax = drawing.panel()
-    flat = [1e-5] * len(separations)
-    drawing.completeness(ax, table, curve_table(), flat, flat)
-    FigureCanvasAgg(figure).draw()
-    meshes = [each for each in ax.collections if isinstance(each, QuadMesh)]
-    assert len(meshes) == len(separations)
-    for separation, mesh in zip(separations, meshes, strict=True):
-        corners = mesh.get_coordinates()
-        # Upright rectangles, each about its contrast.
-        assert np.ptp(corners[..., 1], axis=1).max() == 0
-        edges = corners[:, 0, 1]
-        for cell, strength in enumerate(np.sort(strengths)):
-            assert edges[cell] < strength * 1e-5 / separation < edges[cell + 1]
-        assert corners[0, 0, 0] < separation < corners[0, 1, 0]
-        assert mesh.get_array().ravel().tolist() == [0.25, 0.5, 1.0]
 
 
 def test_ellipses_of_a_corner_are_those_of_the_covariance():

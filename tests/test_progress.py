@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
-
-import pytest
 
 from pyklip_diffrender.io import ProgressBar, progress, stage
 from pyklip_diffrender.io.progress import numbered_stages
@@ -95,36 +92,3 @@ def test_the_time_that_is_left_follows_the_stages_that_have_ended(caplog, monkey
         "3. search, about 2 min left",
         "4. products, about 30 s left",
     ]
-
-
-def test_a_stage_ends_with_its_block_even_when_it_fails():
-    with pytest.raises(ValueError, match="no"), stage("frames"):
-        raise ValueError("no")
-    with ProgressBar("S/N map", shown=False) as bar:
-        assert bar._name == "S/N map"
-
-
-def test_the_time_left_follows_what_is_done_of_a_stage(caplog, monkeypatch):
-    now = 1000.0
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
-    with numbered_stages({"planets": 100.0, "products": 10.0}), stage("planets"):
-        assert progress._left() == ", about 2 min left"
-        now += 90.0
-        # A quarter took 90 s, 3.6 times what was expected.
-        progress.progressed(0.25)
-        assert progress._left() == ", about 5 min left"  # 270 s and 36 s.
-        now += 60.0
-        assert progress._left() == ", about 4 min left"
-    assert not caplog.records
-
-
-def test_a_heartbeat_speaks_while_something_is_waited_for(caplog, monkeypatch):
-    monkeypatch.setattr(progress, "_INTERVAL", 0.01)
-    with caplog.at_level(logging.INFO), progress.heartbeat(lambda: "3 of 4 jobs"):
-        deadline = time.monotonic() + 5
-        while not caplog.records and time.monotonic() < deadline:
-            time.sleep(0.01)
-    assert caplog.records[0].getMessage() == "3 of 4 jobs"
-    count = len(caplog.records)
-    time.sleep(0.05)
-    assert len(caplog.records) == count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -15,9 +15,8 @@ from astropy.table import QTable
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Candidates, measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.recovery import TOGETHER, _free_place
+from pyklip_diffrender.detection.recovery import _free_place
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.reduction import ReduceOptions, pipeline
 
 NORTH = 20.0
 SIZE = 41
@@ -136,45 +135,6 @@ def test_no_planet_is_where_extended_light_would_hide_it():
     assert len(planets) == 5
     assert sum(np.count_nonzero(each) for each in images) == 5
     assert not any(each[hidden].any() for each in images)
-
-
-def test_planets_are_injected_into_the_frames_with_their_disk(monkeypatch):
-    """Whose light is fitted again, and hides other places than before."""
-    frame = dr.Observation.from_arrays(np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06)
-    before, after = (
-        cast(dr.Disk, SimpleNamespace(light=[each * np.ones(frame.shape)], fit=each,
-                                      hides_points=each)) for each in (2.0, 3.0)
-    )  # fmt: skip
-    calls = {}
-
-    def searched_again(fit, **options):
-        calls.update(options, fit=fit)
-
-    monkeypatch.setattr(pipeline, "fit_disk", lambda fit: after if fit == "fit" else before)
-    monkeypatch.setattr(pipeline, "detect", searched_again)
-    monkeypatch.setattr(pipeline, "recover_planets", lambda _, count, search: search((frame,)))
-    options = ReduceOptions(disk=True, injections=3, threshold=4.0)
-    run = pipeline._Run(cast(Any, SimpleNamespace(options=options)), False)
-    monkeypatch.setattr(
-        pipeline._Run, "_fit", lambda _, science, choice: calls.update(science=science) or "fit"
-    )
-    run._inject(cast(Any, None), cast(Any, None), before)
-    (fitted,) = calls["science"]
-    np.testing.assert_allclose(fitted.data[0], frame.data[0] + 2)
-    assert (calls["fit"], calls["without_limits"], calls["threshold"]) == (3.0, 3.0, 4.0)
-
-
-def test_sets_have_at_most_seven_planets_in_a_wide_field():
-    wide = QTable({"separation": [0.2, 1.1] * u.arcsec, "small_sample": [LIMIT, LIMIT]})
-    sizes = []
-
-    def search(science):
-        sizes.append(np.count_nonzero(science[0].data))
-        return searched(science)
-
-    recover_planets(searched(contrast_curve=wide), 4, search)
-    assert sizes == [3, 1]
-    assert TOGETHER == 7
 
 
 @pytest.mark.parametrize(

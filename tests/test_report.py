@@ -26,9 +26,6 @@ import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.units import full_circle, half_circle
-from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction import existing_products, summarise, write_report
 from pyklip_diffrender.reduction.pages import (
     Picture,
@@ -39,14 +36,7 @@ from pyklip_diffrender.reduction.pages import (
     scientific,
     write_figures,
 )
-from pyklip_diffrender.reduction.pictures import (
-    Klip,
-    Overview,
-    ReportPictures,
-    SkyImages,
-    _measured,
-    _stamps,
-)
+from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.products import page
 from pyklip_diffrender.reduction.reduction_result import looks_extended
 from pyklip_diffrender.refinement import Status
@@ -123,48 +113,6 @@ def test_no_writer_replaces_a_file_without_being_asked(tmp_path, write, name):
     assert path.read_text(encoding="utf-8") == "earlier"
 
 
-def test_a_detection_without_a_date_leaves_no_earlier_astrometry(tmp_path):
-    detection = reduction().detection
-    assert tmp_path / "astrometry.csv" in detection.write(tmp_path)
-    undated = replace(detection, fits=detection.fits)
-    vars(undated)["sky"] = replace(detection.sky, mjd=None)
-    undated.write(tmp_path, overwrite=True)
-    assert not (tmp_path / "astrometry.csv").exists()
-
-
-def angles_in(content):
-    """All position angles of a summary."""
-    if isinstance(content, dict):
-        for key, value in content.items():
-            if "angle" in key and "error" not in key and isinstance(value, float):
-                yield value
-            else:
-                yield from angles_in(value)
-    elif isinstance(content, list):
-        for value in content:
-            yield from angles_in(value)
-
-
-def test_position_angles_are_from_0_to_360_wherever_they_are_stated():
-    # The orientation of the frame is given as -330 degrees, and the planet is on the other side.
-    result = reduction()
-    (frame,) = result.sequence.science
-    assert frame.position_angle == ROLL
-    stated = list(angles_in(summarise(result)))
-    assert len(stated) >= 4
-    for angle in stated:
-        assert any(
-            angle == pytest.approx(one, abs=3)
-            for one in (ROLL, PLANET.position_angle, PLANET.position_angle - ROLL)
-        )
-    west = result.detection.measure([[0.4, 0.3]])[0]
-    assert west["position_angle"].value == pytest.approx(-np.rad2deg(np.arctan(4 / 3)) + ROLL + 360)
-    assert dr.Planet.from_offset(1e-5, 0.3, 0.3).position_angle == pytest.approx(315)
-    assert PLANET.rotated(-50).position_angle == pytest.approx(350)
-    assert full_circle(-1e-20) == 0
-    assert half_circle(10.0 - 350.0) == 20
-
-
 class Tags(HTMLParser):
     """All start tags of a page with their attributes, and its text outside the style sheet."""
 
@@ -238,21 +186,6 @@ def test_every_status_comes_with_advice(status):
     assert advice(status, patterned=True).endswith(".")
     missing = "reference stars" in advice(status, patterned=False)
     assert missing == (status is Status.MODEL_MISMATCH)
-
-
-def test_the_report_says_how_much_of_the_pattern_is_there():
-    whole = reduction()
-    assert summarise(whole)["systematics"] is None
-    (frame,) = whole.fit.frames
-    pattern = 0.02 * np.random.default_rng(5).normal(size=frame.star.shape)
-    x, y = frame.observation.center[0].tolist()
-    known = dr.Systematics(pattern, 0 * pattern + 0.01, (x, y), 0.02, name="HD 3")
-    fit = replace(whole.fit, frames=(replace(frame, gain=1 + pattern),), systematics=known)
-    used = summarise(replace(whole, fit=fit, systematics=known))["systematics"]
-    size = pattern_size(fit)
-    assert (used["size"], used["size_error"]) == size
-    # The residual, which is noise, is taken for what is left with the pattern.
-    assert abs(size[0] - 1) < 5 * size[1] < 0.5
 
 
 def test_candidates_in_line_suggest_a_disk():
@@ -444,24 +377,6 @@ def test_a_header_cannot_write_into_the_page(tmp_path):
     assert not [tag for tag, attributes in tags if tag == "script" or "onerror" in attributes]
     assert len([tag for tag, _ in tags if tag == "img"]) == 12
     assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
-
-
-def test_names_beyond_ascii_do_not_end_a_reduction(tmp_path):
-    """FITS headers have printable ASCII only; the page and the summary keep the names."""
-    whole = reduction()
-    (frame,) = whole.detection.fits[0].frames
-    named = replace(frame.observation, name="Čeče_été\n.fits")
-    fit = replace(
-        whole.detection.fits[0],
-        frames=(replace(frame, observation=named),),
-        initial=replace(whole.fit.initial, name="carte_été.fits"),
-    )
-    detection = replace(whole.detection, fits=(fit,))
-    with fits.open(detection.write(tmp_path)[0]) as hdus:
-        assert hdus[0].header["DROPD"] == "carte_ete.fits"
-        assert "frame Cece_ete?.fits" in str(hdus[0].header["HISTORY"])
-    back = dr.Refinement.read(fit.write(tmp_path / "fit.fits", linear=False))
-    assert back.initial.name == "carte_été.fits"
 
 
 @pytest.fixture
@@ -678,105 +593,6 @@ def test_the_report_says_who_is_deeper_where(klip, said):
     assert depth_against_klip(curve | {"separation_arcsec": [0.1, 0.2]}, other) == ""
 
 
-def test_the_first_lines_are_the_result_and_the_status(folder):
-    text = (folder / "report.html").read_text(encoding="utf-8")
-    status = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["status"]
-    sentence, name, picture = (
-        text.index(each)
-        for each in ('class="result"', f"<code>{status['name']}</code>", "<figure>")
-    )
-    assert sentence < name < picture
-
-
-def test_settings_are_a_table(folder):
-    words = Tags((folder / "report.html").read_text(encoding="utf-8")).words
-    at = words.index("Settings of the fit")
-    assert words[words.index("cycles", at) + 2] == "6"
-    assert words[words.index("prior.knee", at) + 2] == "8"
-    assert not [each for each in words if "GaussNewton(" in each or "{'" in each]
-
-
-@pytest.mark.parametrize("own", [False, True])
-def test_reference_frames_are_said_to_be_used_for_what_they_are_used_for(own):
-    """A pattern of a library needs none of them, and only its stars are named."""
-    whole = reduction()
-    star = replace(
-        whole.sequence.science[0], reference=True, header=fits.Header({"TARGPROP": "HD 2"})
-    )
-    flat = np.zeros((4, 4))
-    names = ["HD 2", "HD 7"] if own else ["HD 7", "HD 8"]
-    pattern = dr.Systematics(flat, flat, (1.0, 1.0), 0.02, provenance={"stars": names})
-    part = replace(whole.fit.frames[0], observation=star)
-    result = replace(
-        whole, systematics=pattern,
-        references=(replace(whole.fit, frames=(part,)),) if own else (),
-        sequence=replace(whole.sequence, references=(star,)),
-    )  # fmt: skip
-    text = page(summarise(result), ReportPictures())
-    if own:
-        assert "1 frame of reference stars, for the pattern and KLIP" in text
-        assert "measured on the reference frames of HD 2 and from earlier frames of HD 7" in text
-    else:
-        assert "1 frame of reference stars, for KLIP alone" in text
-        assert "from earlier frames of HD 7, HD 8" in text
-        assert "measured on" not in text
-
-
-def test_without_candidates_those_farther_out_are_mentioned():
-    summary = summarise(reduction(planet=False))
-    (row,) = summarise(reduction())["candidates"]
-    far = {**row, "fit_chi2": 1.1}
-    summary["wide_field"] = {"candidates": [far, far], "contrast_curve": {}}
-    text = " ".join(page(summary, ReportPictures()).split())
-    assert "No candidate has an S/N above 5 in the pixels in which the star was fitted." in text
-    assert "Farther out there are 2 candidates, in the section on the whole frames." in text
-
-
-def test_the_corner_has_the_errors_of_the_table():
-    detection = reduction().detection
-    (row,) = detection.candidates
-    names, values, covariance = _measured(detection, 0)
-    assert names == ("ΔRA cos Dec", "ΔDec")
-    keys = ("contrast", "delta_ra", "delta_dec")
-    for k, key in enumerate(keys):
-        assert values[k] == pytest.approx(getattr(row[key], "value", row[key]), rel=1e-6)
-        error = row[f"{key}_error"]
-        assert np.sqrt(covariance[k, k]) == pytest.approx(getattr(error, "value", error))
-    correlation = covariance[1, 2] / np.sqrt(covariance[1, 1] * covariance[2, 2])
-    assert correlation == pytest.approx(row["radec_corr"], abs=1e-6)
-
-
-def test_stamps_show_the_planet_and_what_the_model_leaves_of_it():
-    detection = reduction().detection
-    (stamp,) = _stamps(detection, 0)
-    middle = len(stamp.x) // 2
-    place = np.array([stamp.x[middle], stamp.y[middle]])
-    on_frame = replace(PLANET, position_angle=PLANET.position_angle - ROLL).offset
-    assert np.abs(place - on_frame).max() < 0.05  # A pixel has 0.063 arcsec.
-    assert np.unravel_index(np.nanargmax(stamp.model), stamp.model.shape) == (middle, middle)
-    left = (stamp.subtracted - stamp.model) / stamp.noise
-    assert 0.7 < np.nanstd(left) < 1.3
-    # A filter with the image of the planet sees it before, and nothing of it after.
-    shape = stamp.model / stamp.noise
-    before, after = (
-        np.nansum(shape * image) / np.sqrt(np.nansum(shape**2))
-        for image in (stamp.subtracted / stamp.noise, left)
-    )
-    assert before > 4
-    assert abs(after) < 2
-    # Without the star, but with the planet.
-    assert np.nanmedian(np.abs(stamp.subtracted)) < 0.1 * np.nanmedian(stamp.data)
-
-
-def test_captions_say_how_much_of_a_source_is_kept(folder):
-    images = SkyImages(reduction())
-    ring = np.abs(np.hypot(*np.moveaxis(images.grid, -1, 0)) - 0.5)
-    resolution = reduction().detection.contrast_curve.meta["resolution_arcsec"]
-    kept = np.nanmedian(images.throughput[ring < resolution / 2])
-    text = (folder / "report.html").read_text(encoding="utf-8")
-    assert f"A faint source keeps {100 * kept:.0f} % of its light at 0.5 arcsec" in text
-
-
 @pytest.mark.parametrize(
     ("form", "begins"), [("pdf", b"%PDF"), ("png", b"\x89PNG"), ("svg", b"<?xml")]
 )
@@ -846,23 +662,6 @@ def test_a_notebook_shows_a_small_escaped_summary(name):
     assert (HOSTILE in said) == (name != "OpticalSystem")
     assert len(repr(value)) < 400
     assert "array(" not in repr(value)
-
-
-def test_a_notebook_shows_the_numbers_of_a_candidate():
-    detection = reduction().detection
-    (row,) = detection.candidates
-    said = Tags(detection._repr_html_()).words
-    assert f"{row['contrast']:.3e}" in said
-    assert f"{row['position_angle'].value:.2f}" in said
-    assert "separation (arcsec)" in said
-    assert "2022-10-03T00:00:00" in said
-
-
-def test_a_long_table_is_cut():
-    text = html_summary("Many", {"left out": None}, QTable({"n": np.arange(30)}), ["n", "absent"])
-    assert text.count("<td>") == 20
-    assert "and 10 more" in text
-    assert "left out" not in text
 
 
 BROWSER = next(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 
 import numpy as np
@@ -20,7 +19,6 @@ from pyklip_diffrender.linear import (
     WavefrontResponse,
     coarse_copy,
     downsample,
-    jacobian,
 )
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.parameters import parameter
@@ -183,48 +181,6 @@ def test_derivatives_follow_changes_in_the_last_pupil(opd, values, name, route):
     assert relative(stored(kept), old) < 1e-5
 
 
-def test_frames_share_derivatives_that_follow(opd, values):
-    """Two frames a few mas apart need one response; a star far from there needs its own."""
-    model, start = system(npix=64, fov_pixels=(44, 48)), downsample(opd, 64)
-    basis = FourierModes(3)
-    responses = ResponseCache(model, basis, npix=64, keep=3)
-    moved = {**values, "star_offset": values["star_offset"] + torch.tensor([0.008, 0.0])}
-    far = {**values, "star_offset": values["star_offset"] + torch.tensor([0.05, 0.0])}
-    first = responses.near(start, values)
-    before = [each.clone() for each in stored(first)]
-    reading = responses.reading()
-    assert reading.near(start, moved) is first
-    assert relative(stored(first), before) > 0.05
-    assert 0.01 < reading.farthest < 0.05
-    second = responses.near(start, far)
-    assert second is not first
-    assert responses.near(start, values) is first
-    assert responses.near(start, far) is second
-    assert relative(stored(first), before) < 1e-5
-    names = ("star_offset", "blur")
-    fields = model.fields(start, **moved)
-    slopes = responses.parameters(start, values, names, model.fields(start, **values))
-    assert slopes.shape == (3, 44, 48)
-    again = responses.parameters(start, moved, names, fields)
-    anew = parameter_jacobian(model, start, moved, names, fields)
-    assert float((again - anew).norm() / anew.norm()) < 0.5 * float(
-        (slopes - anew).norm() / anew.norm()
-    )
-
-
-def test_an_aberration_in_front_of_the_occulter_is_not_followed(opd, values):
-    """New derivatives instead."""
-    model, start = system(npix=64), downsample(opd, 64)
-    moved = {**values, "si_zernikes": torch.full((36,), 2e-9, dtype=torch.float64)}
-    for planes, follows in ((model.planes, True), (model.planes[::-1], False)):
-        other = copy.copy(model)
-        other.planes = planes
-        assert ("si_zernikes" in other.parameters_behind) is follows
-        responses = ResponseCache(other, FourierModes(3), npix=64, keep=2, relinearise=0.01)
-        first = responses.near(start, values)
-        assert (responses.near(start, moved) is first) is follows
-
-
 @pytest.mark.hard
 def test_piston_of_the_whole_pupil_does_nothing(opd):
     model = system(npix=128)
@@ -233,22 +189,6 @@ def test_piston_of_the_whole_pupil_does_nothing(opd):
     together = image[0::3].sum(dim=0)
     # The outlines, widened to the middle of the gaps, leave a few thousandths at the corners.
     assert float(together.norm()) < 5e-3 * float(image[0::3].norm())
-
-
-def test_jacobian_of_real_and_complex_outputs():
-    x = torch.linspace(-1, 1, 5, dtype=torch.float64)
-
-    def outputs(at):
-        phase = at[0] * x + at[1] ** 2 * x[:, None]
-        return [torch.polar(1 + 0 * phase, phase), at[1] * x]
-
-    at = torch.tensor([0.7, -0.4], dtype=torch.float64)
-    with torch.no_grad():  # As in a fit.
-        field, line = jacobian(outputs, at)
-    value = outputs(at)[0]
-    torch.testing.assert_close(field, torch.stack([1j * x * value, -0.8j * x[:, None] * value]))
-    torch.testing.assert_close(line, torch.stack([0 * x, x]))
-    assert not at.requires_grad
 
 
 NAMES = ("star_offset", "lyot_shift", "lyot_rotation", "si_zernikes", "detector_shift", "blur")
@@ -273,17 +213,6 @@ def test_parameter_jacobian_is_the_slope_of_the_model(opd, values, name):
             at = [model(small, **{**given, name: start + s * change}) for s in (-2, -1, 1, 2)]
         expected = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step)
         assert float((jacobian[k] - expected).norm() / expected.norm()) < 1e-5
-
-
-def test_parameter_jacobian_keeps_the_order_of_names(opd, values):
-    model, small = system(npix=64), downsample(opd, 64)
-    both = parameter_jacobian(model, small, values, ("lyot_rotation", "star_offset"))
-    assert both.shape[0] == 3
-    rotation, offset = (
-        parameter_jacobian(model, small, values, (n,)) for n in ("lyot_rotation", "star_offset")
-    )
-    torch.testing.assert_close(both[:1], rotation, rtol=1e-12, atol=0)
-    torch.testing.assert_close(both[1:], offset, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -322,12 +251,6 @@ def test_coarse_copy_is_coarser_or_the_model_itself():
     assert coarse_copy(model, 256) is model
     same = coarse_copy(model, 100)  # 256 pixels do not divide into 100.
     assert (same.npix, same.dtype) == (256, torch.float32)
-
-
-def test_downsample_takes_means(opd):
-    expected = opd.reshape(64, 4, 64, 4).mean(dim=(1, 3))
-    torch.testing.assert_close(downsample(opd, 64), expected, rtol=1e-12, atol=1e-22)
-    assert downsample(opd, NPIX) is opd
 
 
 @pytest.fixture
@@ -403,16 +326,6 @@ def test_the_log_evidence_is_that_of_the_data(linear):
     one, other = (torch.tensor(s, dtype=torch.float64) for s in ([3.0, 0.4], [2.0, 1.0]))
     got = solved(proper, one, 0).log_evidence - solved(proper, other, 0).log_evidence
     assert got == pytest.approx(exact(one) - exact(other), rel=1e-6)
-
-
-@pytest.mark.slow
-def test_an_absent_kind_ends_at_the_floor(linear):
-    truth = linear["truth"].clone()
-    truth[2:][linear["group"] == 1] = 0
-    silent = {**linear, "observed": linear["design"] @ truth}
-    got = solved(silent, torch.tensor([3.0, 0.4], dtype=torch.float64), 200)
-    assert float(got.scales[1]) < 0.02
-    assert torch.isfinite(got.step).all()
 
 
 def test_what_no_wavefront_explains_ends_at_the_ceiling():

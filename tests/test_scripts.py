@@ -31,10 +31,6 @@ def run(script, monkeypatch):
         runpy.run_path(str(ROOT / script), run_name="__main__")
 
 
-def test_there_are_scripts():
-    assert len(SCRIPTS) > 20
-
-
 @pytest.mark.parametrize("script", [each for each in SCRIPTS if each not in WITHOUT_OPTIONS])
 def test_help(script, monkeypatch, capsys):
     if "slurm" in script:

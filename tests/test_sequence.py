@@ -311,24 +311,6 @@ def test_a_refinement_survives_the_file(tmp_path):
     np.testing.assert_array_equal(again["contrast_error"], first["contrast_error"])
 
 
-@pytest.mark.slow
-def test_a_detection_in_a_file_is_that_in_the_fit(tmp_path):
-    fit = rolled_fit()
-    again, first = detect(Refinement.read(fit.write(tmp_path / "fit.fits"))), detect(fit)
-    np.testing.assert_array_equal(again.snr, first.snr)
-    np.testing.assert_array_equal(again.candidates["contrast"], first.candidates["contrast"])
-    assert again.candidates["position_angle"][0].to_value(u.deg) == pytest.approx(40, abs=0.5)
-
-
-@pytest.mark.parametrize("percent", [25, 50, 99])
-def test_half_a_file_is_no_refinement(tmp_path, percent):
-    path = reference_fit().write(tmp_path / "fit.fits")
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    with pytest.raises(CorruptFileError, match=r"fit\.fits"):
-        Refinement.read(path)
-
-
 def test_reduce_says_what_systematics_it_takes():
     sequence = Sequence("TARGET", (frame("TARGET", 20),))
     with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'references'"):

@@ -13,8 +13,8 @@ from astropy.io import fits
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.instrument import detector_place, filter_shift, nircam_coronagraph
 from pyklip_diffrender.reduction import reduce
-from pyklip_diffrender.refinement import GaussNewton, Status, refine, settings_for
-from pyklip_diffrender.scene import Observation, Planet, Scene, Sequence, Star, model_for, simulate
+from pyklip_diffrender.refinement import GaussNewton, refine, settings_for
+from pyklip_diffrender.scene import Observation, Planet, Sequence, model_for
 from pyklip_diffrender.scene.jwst_files import mask_place
 from pyklip_diffrender.wavefront import random_opd
 
@@ -181,27 +181,3 @@ def test_the_place_along_a_bar_is_that_of_the_header():
     opd = random_opd(1, npix=256)
     hidden, beside = (float(model(opd, (0.0, y)).sum()) for y in (0.0, 0.6))
     assert hidden < 0.05 * beside
-
-
-@pytest.mark.slow
-def test_the_wavefront_may_change_between_frames():
-    """By 2 nm, which without a prior on it is taken for a shift of the star."""
-    model = nircam_coronagraph(
-        "F210M", image_mask="MASK210R", monochromatic=2.09e-6, npix=128, fov_pixels=32
-    )
-    sensed = random_opd(1, npix=128)
-    moved = sensed.data + random_opd(2, npix=128, rms=6e-9).data
-    scene = Scene(star=Star(w2_magnitude=8.5))
-    frames = [
-        simulate(model, scene, moved + random_opd(10 + k, npix=128, rms=2e-9).data, seed=k)
-        for k in range(2)
-    ]
-    settings = GaussNewton.nircam("F210M", cycles=(7.0,), drift_cycles=6.0, max_iterations=20)
-    fit = refine(model, frames, sensed, settings=settings)
-    assert fit.status is Status.CONVERGED
-    assert fit.chi2_per_pixel < 1.2
-    for frame in fit.frames:
-        assert frame.flux == pytest.approx(scene.star.photons, rel=0.05)
-        assert float(frame.optical_values["star_offset"].norm()) < 2e-3
-    shared = refine(model, frames, sensed, settings=replace(settings, drift=None, max_iterations=8))
-    assert shared.chi2_per_pixel > 3

@@ -253,11 +253,6 @@ def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path):
         require_calibrated(got)
 
 
-def test_simulated_frames_have_no_flux_density():
-    frames = Observation.from_arrays(np.ones((4, 4)), np.ones((4, 4)), pixelscale=0.06)
-    assert jansky_per_unit(fitted(frames)) is None
-
-
 @pytest.mark.parametrize(
     "star", [0.36308, "0.36308 Jy", 363.08 * u.mJy, 10.0 * u.ABmag, "363.08 mJy"]
 )

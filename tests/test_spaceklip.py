@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ import torch
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
 from pyklip.instruments import JWST
-from pyklip.parallelized import klip_dataset
 
 from benchmarks.calints_files import calints
 from pyklip_diffrender import spaceklip
@@ -24,7 +22,7 @@ from pyklip_diffrender.detection.field import Sky
 from pyklip_diffrender.detection.measurement import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.pyklip_backend import backend, klip_call
+from pyklip_diffrender.pyklip_backend import backend
 from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.spaceklip import run
 from pyklip_diffrender.spaceklip.database_files import (
@@ -309,25 +307,6 @@ def test_a_concatenation_from_frames_to_sources(
     assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").candidates["snr"][0] > 5
 
 
-@pytest.mark.slow
-def test_a_catalogues_star_is_that_of_the_search(tmp_path, monkeypatch):
-    model, files = two_rolls(tmp_path, monkeypatch)
-    tied = []
-
-    def with_star_flux(fit, jansky, error, **options):
-        tied.append((jansky, error))
-        return replace(fit, catalogue_error=error)
-
-    monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.with_star_flux", with_star_flux)
-    detections = spaceklip.run_obs(
-        StandIn(tmp_path, {KEY: concatenation(files)}), opd=OPD, model=model, systematics="off",
-        fit=ALIGNED, star_flux={"F444W": "450 mJy"}, star_flux_error=0.3,
-    )  # fmt: skip
-    assert tied == [(pytest.approx(0.45), 0.3)]
-    table = detections[KEY].candidates
-    assert table["contrast_error"][0] / table["contrast"][0] == pytest.approx(0.3, rel=0.1)
-
-
 def test_a_flux_of_no_filter_is_refused(tmp_path):
     database = StandIn(tmp_path, {KEY: concatenation(["one_calints.fits"])})
     with pytest.raises(IncompatibleSetupError, match=r"'F335M'.*\['F444W'\]"):
@@ -359,26 +338,3 @@ def test_spaceklips_own_subtraction(tmp_path, monkeypatch, real_database):
     (product,) = (tmp_path / "own").glob("*-KLmodes-all.fits")
     assert fits.getheader(product)["DRALGO"] == "diffrender"
     assert len(list((tmp_path / "own").glob("*_roll*.fits"))) == 2
-
-
-@pytest.mark.slow
-def test_spaceklips_own_injections_need_one_fit(tmp_path, monkeypatch):
-    tools = pytest.importorskip("spaceKLIP.analysistools", exc_type=ImportError)
-    model, files = two_rolls(tmp_path, monkeypatch)
-    options = {
-        "mode": "ADI", "annuli": 1, "subsections": 1, "numbasis": [1], "movement": 1,
-        "calibrate_flux": False, "highpass": False, "verbose": False, "outputdir": f"{tmp_path}/",
-    }  # fmt: skip
-    with backend(opd=OPD, model=model, systematics="off", fit=ALIGNED, image="subtracted"):
-        dataset = JWST.JWSTData(files, None, highpass=False)
-        before = copy.deepcopy(dataset)
-        klip_dataset(dataset, fileprefix="once", **options)
-    monkeypatch.setattr(klip_call, "subtract_by_refinement", None)
-    y, x = np.indices((25, 25)) - 12
-    peak = 1e-3 * FLUX * float(model(OPD.data, star_offset=(0.8, 0.0)).max())
-    with backend(injected_into=dataset, image="subtracted"):
-        _, _, injected, retrieved = tools.inject_and_recover(
-            before, np.exp(-(x**2 + y**2) / 2), np.array([8.0, 13.0]), np.array([20.0, 250.0]),
-            None, np.full(2, peak), {**options, "algo": "klip"}, 2.35,
-        )  # fmt: skip
-    np.testing.assert_allclose(retrieved[:, 0] / injected, 1.0, atol=0.1)

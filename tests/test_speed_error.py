@@ -2,29 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from benchmarks import speed_error
 from benchmarks.speed.setting import Setting
-from benchmarks.speed_error import TITLES, Point, as_table, draw
-
-
-def test_a_figure_has_a_panel_for_each_task_and_a_line_for_each_way():
-    points = [
-        Point(what, way, f"{k}", 10.0**k, 10.0**-k)
-        for what in ("image", "gradient", "fit", "reduction")
-        for way in ("fewer samples across the pupil", "KLIP")
-        for k in range(3)
-    ]
-    figure = draw(as_table(points, "python -m benchmarks.speed_error"))
-    assert [ax.get_title() for ax in figure.axes] == [
-        TITLES[each] for each in ("image", "gradient", "fit", "reduction")
-    ]
-    for ax in figure.axes:
-        lines = [line for line in ax.get_lines() if len(line.get_xdata()) == 3]
-        assert len(lines) == 2
-        np.testing.assert_allclose(lines[0].get_ydata(), [1, 0.1, 0.01])
 
 
 @pytest.mark.slow

@@ -68,13 +68,6 @@ def test_power_law_in_every_format(tmp_path, write, filter):
     assert flux.to_value(u.Jy) == pytest.approx(expected(filter), rel=1e-4)
 
 
-def test_reduce_takes_the_flux(tmp_path):
-    from pyklip_diffrender.refinement import to_jansky
-
-    flux = dr.star_flux_density(as_text(tmp_path), "F444W")
-    assert to_jansky(flux) == pytest.approx(flux.value)
-
-
 def test_files_that_do_not_say_the_flux(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"missing\.txt: no such file"):
         dr.star_flux_density(tmp_path / "missing.txt", "F444W")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import gzip
-import json
 from pathlib import Path
 
 import numpy as np
@@ -180,12 +179,3 @@ def test_configurations_may_begin_with_a_byte_order_mark(tmp_path):
     config = tmp_path / "run.toml"
     config.write_text(f"{MARK}quiet = true\n[psf]\nsize = 20\n", encoding="utf-8")
     assert command_config(application.commands["psf"], config)["size"] == 20
-
-
-def test_records_of_a_survey_may_have_been_saved_with_a_mark(tmp_path):
-    from pyklip_diffrender.surveys.jobs import RECORD, read_record
-
-    key = tmp_path.name.rpartition("_")[2]
-    record = {"status": "finished", "job": {"key": key}, "products": {}}
-    (tmp_path / RECORD).write_text(MARK + json.dumps(record), encoding="utf-8")
-    assert read_record(tmp_path) == record

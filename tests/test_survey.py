@@ -7,43 +7,28 @@ import os
 import shutil
 import subprocess
 import sys
-from concurrent.futures import CancelledError
 from dataclasses import replace
 from datetime import date
 from functools import partial
 from html.parser import HTMLParser
 from math import inf
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
-import torch
-from astropy import units as u
 from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import Table
 from survey_stubs import HOSTILE, configuration, inputs, result, stub
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import CENTER, SIDE, calints
 from pyklip_diffrender.cli import main
-from pyklip_diffrender.detection import Candidates, with_planets
-from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, RefinementError
-from pyklip_diffrender.reduction import ReduceOptions
-from pyklip_diffrender.refinement import FrameFit, GaussNewton
-from pyklip_diffrender.surveys import execution, survey_page
-from pyklip_diffrender.surveys import execution as work
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.surveys import execution
 from pyklip_diffrender.surveys import jobs as folders
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
-from pyklip_diffrender.surveys.jobs import Injection, jobs_of
-from pyklip_diffrender.surveys.survey_page import COLUMNS, table_of
-
-ROOT = Path(__file__).resolve().parents[1]
-
-CURVE = ("sigmas", "separation_arcsec", "contrast")
+from pyklip_diffrender.surveys.jobs import jobs_of
 
 PLANETS = {"contrasts": [1e-5, 3e-6], "separations": [0.5, 1.0], "angles": [0, 90.0]}
 
@@ -66,13 +51,6 @@ def planned(config):
 def hidden(output):
     """What is left of jobs that never ended."""
     return [path.name for path in (output / "jobs").iterdir() if path.name.startswith(".")]
-
-
-def test_a_file_says_the_same_as_a_mapping(tmp_path):
-    config = inputs(tmp_path)
-    path = configuration(tmp_path / "survey.toml", config)
-    assert read_config(path) == read_config(config)
-    assert [job.key for job in planned(config)] == [job.key for job in jobs_of(read_config(path))]
 
 
 def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
@@ -160,21 +138,6 @@ def test_a_mistake_is_named_before_anything_is_done(tmp_path, where, key, value,
     assert not (tmp_path / "out").exists()
 
 
-def test_all_mistakes_are_named_at_once(tmp_path):
-    config = {"workers": "two", "sequence": [{"files": []}, 3, {"opd": "x", "size": 1}]}
-    with pytest.raises(IncompatibleSetupError) as raised:
-        read_config(config)
-    text = str(raised.value)
-    for word in (
-        "workers",
-        "sequence 1: files",
-        "sequence 1: opd",
-        "sequence 2",
-        "sequence 3: size",
-    ):
-        assert word in text
-
-
 @pytest.mark.parametrize("content", [b"a = [", b"\xff", b"[" * 5000, b"a = 1\na = 2"])
 def test_a_file_that_is_not_toml(tmp_path, content):
     path = tmp_path / "survey.toml"
@@ -190,46 +153,6 @@ def test_the_same_job_twice_is_a_mistake(tmp_path):
     config["sequence"].append({**config["sequence"][0], "name": "again"})
     with pytest.raises(IncompatibleSetupError, match="again: got the same inputs and options"):
         planned(config)
-
-
-def calints_file(path, star, day, *, reference=False):
-    primary = fits.PrimaryHDU()
-    primary.header.update({"FILTER": "F444W", "TARGPROP": star, "IS_PSF": reference})
-    if day is not None:
-        primary.header["DATE-BEG"] = f"{day}T00:00:00"
-    data = np.random.default_rng(1).normal(10, 2, (2, 8, 10)).astype(np.float32)
-    planes = {"SCI": data, "ERR": np.ones_like(data), "DQ": np.zeros(data.shape, dtype=np.uint32)}
-    hdus = [primary, *(fits.ImageHDU(array, name=name) for name, array in planes.items())]
-    hdus[1].header.update(
-        {"BUNIT": "MJy/sr", "PIXAR_A2": 0.00396, "CRPIX1": 6.0, "CRPIX2": 5.0,
-         "ROLL_REF": 100.0, "V3I_YANG": -0.5, "VPARITY": -1}
-    )  # fmt: skip
-    fits.HDUList(hdus).writeto(path, overwrite=True)
-
-
-def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path):
-    config = inputs(tmp_path, 1)
-    maps = tmp_path / "maps"
-    maps.mkdir()
-    for day in ("01", "11", "29"):
-        hdu = fits.PrimaryHDU(1e-8 * np.random.default_rng(1).normal(size=(16, 16)))
-        hdu.header["BUNIT"] = "m"
-        hdu.header["DATE-OBS"] = f"2022-08-{day}T00:00:00"
-        hdu.writeto(maps / f"map{day}.fits")
-    (maps / "broken.fits").write_bytes(b"nothing")
-    config["sequence"][0]["opd"] = str(maps)
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    config["sequence"][0]["files"] = str(frames)
-    calints_file(frames / "target.fits", "HD-1", None)
-    with pytest.raises(IncompatibleSetupError, match="no date"):
-        planned(config)
-    # The reference star was observed when another map was the nearest.
-    calints_file(frames / "target.fits", "HD-1", "2022-08-15")
-    calints_file(frames / "reference.fits", "HD-2", "2022-08-01", reference=True)
-    (job,) = planned(config)
-    assert job.opd == str(maps / "map11.fits")
-    assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
 
 
 def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path):
@@ -295,18 +218,6 @@ def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path):
     assert f'"jobs/{names[0]}/report.html"' in page
 
 
-def test_tables_have_units_and_descriptions(tmp_path):
-    run_survey(inputs(tmp_path / "a", 1), tmp_path / "out", stub)
-    table = Table.read(tmp_path / "out/results.ecsv")
-    for name in ("separation_arcsec", "injected_separation_arcsec"):
-        assert table[name].unit == u.arcsec
-    assert table["position_angle_deg"].unit == table["injected_angle_deg"].unit == u.deg
-    assert (table["seconds"].unit, table["peak_memory_bytes"].unit) == (u.s, u.byte)
-    # Limits are contrasts.
-    assert all(table[name].unit is None for name in table.colnames if name.startswith("limit"))
-    assert "0.5 arcsec" in table["limit_0.5_arcsec"].description
-
-
 def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path):
     config = inputs(tmp_path / "a", 1)
     (job,) = planned(config)
@@ -318,14 +229,6 @@ def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path):
         assert [each.key for each in planned(other)] != [job.key]
     Path(config["sequence"][0]["opd"]).write_bytes(b"another map")
     assert [each.key for each in planned(config)] != [job.key]
-
-
-def test_a_new_version_is_a_new_job(tmp_path, monkeypatch):
-    config = inputs(tmp_path, 1)
-    (old,) = planned(config)
-    monkeypatch.setattr("pyklip_diffrender.surveys.jobs.__version__", "99.0")
-    (new,) = planned(config)
-    assert new.key != old.key
 
 
 def test_finished_jobs_are_not_run_again(tmp_path):
@@ -378,22 +281,6 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path):
     assert hidden(output) == []
 
 
-def test_an_injection_starts_from_the_finished_reduction(tmp_path):
-    config = inputs(tmp_path / "data", 1)
-    config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
-
-    def work(job, folder):
-        if job.injection:
-            assert (folder.parent / str(job.base_folder) / "report.html").exists()
-        return stub(job, folder)
-
-    table = run_survey(config, tmp_path / "out", work)
-    assert list(table["status"]) == ["finished"] * 2
-    assert table["injected_contrast"].tolist() == [None, 1e-5]
-    assert table["recovered_contrast"].tolist() == [None, 1.1e-5]
-    assert table["recovered"].tolist() == [None, True]
-
-
 def test_what_another_survey_published_meanwhile_stays(tmp_path):
     (job,) = planned(inputs(tmp_path / "data", 1))
     jobs = folders.prepare(tmp_path / "out")
@@ -425,44 +312,6 @@ def test_only_what_dead_processes_left_is_removed(tmp_path):
     os.utime(elsewhere, (0, 0))
     folders.clean(jobs)
     assert sorted(jobs.iterdir()) == sorted([mine, elsewhere])
-
-
-def test_containers_with_one_host_name_leave_each_other_alone(tmp_path, monkeypatch):
-    """The first process of another container has a number that means nothing here."""
-    jobs = folders.prepare(tmp_path)
-    here = os.stat
-    folders._place.cache_clear()
-    monkeypatch.setattr(
-        os, "stat",
-        lambda path, **options: SimpleNamespace(st_ino=1)
-        if path == "/proc/self/ns/pid" else here(path, **options),
-    )  # fmt: skip
-    theirs = folders.staging(jobs, "a" * 64)
-    monkeypatch.undo()
-    folders._place.cache_clear()
-    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
-        pass
-    foreign = theirs.rename(str(theirs).replace(f"-{os.getpid()}-", f"-{dead.pid}-"))
-    folders.clean(jobs)
-    assert list(jobs.iterdir()) == [foreign]
-
-
-def test_a_message_in_another_encoding_stops_nothing(tmp_path):
-    config, output = inputs(tmp_path / "data", 2), tmp_path / "out"
-
-    def work(job, folder):
-        if job.name.startswith("star1"):
-            # As Python quotes a Latin-1 name of a file.
-            raise ValueError("no such file: " + os.fsdecode(b"caf\xe9.fits"))
-        return stub(job, folder)
-
-    for _ in range(2):
-        table = run_survey(config, output, work)
-        assert sorted(table["status"]) == ["failed", "finished"]
-    (message,) = table["message"][table["status"] == "failed"]
-    assert message == r"ValueError: no such file: caf\udce9.fits"
-    assert message in Table.read(output / "results.ecsv")["message"]
-    assert list(run_survey(config, output, stub)["status"]) == ["finished"] * 2
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])
@@ -575,24 +424,6 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path):
         assert (output / link).exists()
 
 
-@pytest.mark.usefixtures("_drawn")
-def test_a_survey_of_many_stars_has_one_picture(tmp_path):
-    (job,) = planned(inputs(tmp_path / "data", 1))
-    record = {"status": "finished", "result": result(), "seconds": 1.0}
-    rows = [(replace(job, name=f"star {k}"), record) for k in range(12)]
-    text = survey_page.page([*rows, (job, None)])
-    assert "12 of 13 jobs finished, 1 not finished yet" in text
-    assert "12 sequences reduced, 12 companion candidates in 12 of them." in text
-
-
-def test_the_table_shows_its_contrasts_on_80_columns():
-    values = {"name": "HIP-65426_F444W", "status": "finished", "contrast": 3.6276222428e-4,
-              "snr": 70.0387387, "message": "none", "key": "0123456789abcdef"}  # fmt: skip
-    shown = table_of([dict.fromkeys(COLUMNS) | values]).pformat(max_width=80)
-    assert max(map(len, shown)) <= 80
-    assert {"3.63e-04", "70.0"} <= set(shown[-1].split())
-
-
 @pytest.mark.parametrize("missing", ["dask", "pyarrow"])
 def test_without_the_extra(tmp_path, monkeypatch, missing):
     config = inputs(tmp_path / "data", 1)
@@ -609,50 +440,6 @@ def test_without_the_extra(tmp_path, monkeypatch, missing):
     assert list(run_survey(config, tmp_path / "out", stub)["status"]) == ["finished"]
     assert (tmp_path / "out" / "results.ecsv").exists()
     assert (tmp_path / "out" / "results.parquet").exists() == (missing != "pyarrow")
-
-
-def test_an_output_that_is_a_file_is_refused(tmp_path):
-    (tmp_path / "out").write_text("mine")
-    with pytest.raises(IncompatibleSetupError, match=r"output: got .*out, expected a folder"):
-        run_survey(inputs(tmp_path / "data", 1), tmp_path / "out", stub)
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-def test_a_table_that_cannot_be_written_stops_nothing(tmp_path, caplog):
-    config, output = inputs(tmp_path / "data"), tmp_path / "out"
-    (output / "results.ecsv").mkdir(parents=True)
-    with pytest.raises(IncompatibleSetupError, match="Is a directory"):
-        run_survey(config, output, stub)
-    assert "Is a directory" in caplog.text
-    (output / "results.ecsv").rmdir()
-    assert list(run_survey(config, output, pytest.fail)["status"]) == ["finished"] * 3
-
-
-def test_a_job_that_another_disk_has_is_a_failure(tmp_path):
-    (job,) = planned(inputs(tmp_path / "data", 1))
-    jobs = folders.prepare(tmp_path / "out")
-
-    class Future:
-        def result(self):
-            return {"status": "finished", "host": "node7"}
-
-    record = execution._record_of(Future(), job, jobs, patience=0)
-    assert record["status"] == "failed"
-    assert "node7 wrote its products to another disk" in record["message"]
-
-
-def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path):
-    (job,) = planned(inputs(tmp_path / "data", 1))
-    jobs = folders.prepare(tmp_path / "out")
-
-    class Future:
-        def result(self):
-            raise CancelledError
-
-    with pytest.raises(RefinementError, match="scheduler was lost"):
-        execution._record_of(Future(), job, jobs)
-    record = execution.run_job(job, jobs, stub)
-    assert execution._record_of(Future(), job, jobs) == record
 
 
 @pytest.fixture
@@ -696,137 +483,6 @@ def test_an_interrupted_command_says_that_it_can_go_on(tmp_path, do, capsys):
     assert "finished jobs are kept" in capsys.readouterr().err
     table = Table.read(output / "results.ecsv")
     assert list(table["status"]) == ["finished", "waiting", "waiting"]
-
-
-def test_jobs_aim_at_less_than_the_memory_of_their_worker(tmp_path, do):
-    limits = []
-
-    def work(job, folder, memory=None):
-        limits.append(memory)
-        return stub(job, folder)
-
-    do(work)
-    config = inputs(tmp_path / "data", 1)
-    survey({**config, "memory_limit": "4 GB"}, tmp_path / "limited")
-    survey(config, tmp_path / "free")
-    assert limits == [3.2e9, None]
-
-
-def test_a_configuration_with_mistakes_is_an_error(tmp_path, capsys):
-    path = tmp_path / "survey.toml"
-    path.write_text("workers = -1")
-    assert main(["survey", str(path), "-o", str(tmp_path / "out")]) == 1
-    said = capsys.readouterr().err
-    assert "survey.toml: nothing was started:\n  workers: got -1" in said
-    assert not (tmp_path / "out").exists()
-
-
-def test_public_name():
-    assert dr.survey is survey
-
-
-ROLLS = (20.0, 60.0)
-
-
-def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for():
-    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    scene, opd = dr.Scene(dr.Star(exposure=200.0)), dr.random_opd(1, npix=128)
-    star = dr.simulate(model, scene, opd, seed=5)
-    nothing = np.zeros((32, 32))
-    values = {"flux": np.array([scene.star.photons]), "background": np.zeros(1)}
-    frames = [
-        FrameFit(
-            model, replace(star, position_angles=np.array([roll])), {}, opd.data, nothing,
-            nothing, values, {}, nothing, np.zeros(0),
-        )
-        for roll in ROLLS
-    ]  # fmt: skip
-    planet = Injection(1e-4, 0.6, 100.0)
-    science = with_planets(frames, [work._planet(planet, ROLLS[0])])
-    assert len(science) == 2
-    for roll, frame in zip(ROLLS, science, strict=True):
-        light = (frame.data - star.data)[0]
-        # Position angles of planets in a scene are counted from +y of the frame.
-        truth = dr.Planet(planet.contrast, planet.separation, planet.angle - roll)
-        expected = dr.simulate(model, replace(scene, planets=(truth,)), opd, seed=5).data[0]
-        x, y = np.round(np.array(truth.offset) / 0.0624 + 15.5).astype(int)
-        core = (slice(y - 2, y + 3), slice(x - 2, x + 3))
-        assert light[core].max() == light.max()
-        # The photon noise of the star under the planet is 3 % of the planet.
-        assert light[core].sum() == pytest.approx((expected - star.data[0])[core].sum(), rel=0.1)
-
-
-def test_a_disk_and_the_whole_frames_are_part_of_the_job(tmp_path):
-    config = inputs(tmp_path, 1)
-    # Other fields than those asked for are those of the preset in the filter of the frames.
-    settings = GaussNewton.nircam("F356W", max_iterations=7)
-    ones = np.ones((4, 4))
-    frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F356W")
-    for name in ("wide", "disk"):
-        options = {name: True, "star_flux": 0.4, "settings": {"max_iterations": 7}}
-        (job,) = planned({**config, "options": options})
-        expected = ReduceOptions(size=40, star_flux=0.4, settings=settings, **{name: True})
-        assert work._options(job, frame) == expected
-        assert work._options(job, frame, wide=False).wide is False
-
-
-def test_the_result_of_a_job_is_that_of_the_largest_field():
-    wide_field = {"candidates": [{"snr": 7.0}], "contrast_curve": {k: [] for k in CURVE}}
-    summary = {
-        **result(), "status": {"name": "CONVERGED"}, "fit": {"reduced_chi2": 1, "error_factor": 1},
-        "contrast_curve": {k: [1.0] for k in CURVE}, "frames": [], "wide_field": wide_field,
-    }  # fmt: skip
-    record = work._result(summary)
-    assert [each["false_alarm_probability"] for each in record["candidates"]] == [None]
-    assert record["curve"] == wide_field["contrast_curve"]
-    record = work._result({**summary, "wide_field": None})
-    assert record["curve"] == summary["contrast_curve"]
-    assert [each["snr"] for each in record["candidates"]] == [30.0]
-
-
-def test_a_planet_is_injected_into_the_frames_with_their_disk():
-    ones = np.ones((30, 30))
-    cut = dr.Observation.from_arrays(3 * ones, ones, pixelscale=0.063).cutout(8)
-    frame = FrameFit(
-        cast(Any, None), replace(cut, data=cut.data - 2), {}, ones, ones, ones, {}, {}, ones,
-        np.zeros(0),
-    )  # fmt: skip
-    (with_disk,) = work._with_disk([frame], [cut])
-    assert (with_disk.observation.data == 3).all()
-
-
-def test_what_is_recovered_is_the_candidate_at_the_place():
-    planet = Injection(1e-4, 0.6, 100.0)
-    x, y = dr.Planet(1e-4, 0.6, 100.0 - 20.0).offset
-
-    def searched(*rows):
-        """Candidates of x, y and contrast, with an error of 1e-5."""
-        table = np.reshape(rows, (-1, 3))
-        errors = torch.full((len(table),), 1e-5, dtype=torch.float64)
-        sources = replace(
-            Candidates.at(table[:, :2], table[:, 2]),
-            covariance=torch.diag(errors.repeat(3) ** 2),
-            detection_errors=errors,
-        )
-
-        def measure(offsets):
-            np.testing.assert_allclose(offsets, [[x, y]])
-            return QTable({"contrast": [4.5e-5], "contrast_error": [2e-5], "snr": [4.5]})
-
-        star = SimpleNamespace(frames=[SimpleNamespace(flux=3.0)])
-        detection = SimpleNamespace(
-            north=20.0, sources=sources, error_factor=ErrorFactor.constant(1.0), measure=measure,
-            fits=[star],
-        )  # fmt: skip
-        return SimpleNamespace(detection=detection)
-
-    other = (0.5, 0.5, 7e-5)
-    recovered = work._recovered(searched(other, (x + 0.03, y, 9e-5)), planet, 2.0)
-    expected = {"contrast": 1.35e-4, "contrast_error": 1.5e-5, "snr": 9.0, "detected": True}
-    assert recovered == pytest.approx(expected)
-    for rows in ((other,), ()):
-        recovered = work._recovered(searched(*rows), planet, 3.0)
-        assert (recovered["snr"], recovered["detected"]) == (4.5, False)
 
 
 @pytest.mark.slow

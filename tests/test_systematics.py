@@ -23,12 +23,11 @@ from pyklip_diffrender.pattern.measure import (
 )
 from pyklip_diffrender.refinement import GaussNewton, Status
 from pyklip_diffrender.refinement.fitting import refine_again
-from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.opd import as_opd_map, random_opd
+from pyklip_diffrender.wavefront.opd import random_opd
 
 NPIX, SIZE, FLUX, READ_NOISE = 64, 32, 3e10, 42.0
 BASIS = JointBasis([SegmentMotions(), FourierModes(4)])
@@ -399,16 +398,3 @@ def test_a_pattern_is_not_shrunk_by_errors_that_are_too_large():
         # The slope of the truth against the pattern is 1 if it is shrunk as it should be.
         slope = (error * pattern)[far].sum() / (pattern**2)[far].sum()
         assert slope == pytest.approx(1.0, abs=0.05)
-
-
-def test_a_given_start_wins_over_the_default_of_the_model():
-    usual = {"lyot_rotation": 0.5, "lyot_shift": (0.01, 0.0)}
-    system = dr.nircam_coronagraph(
-        "F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE, defaults=usual
-    )
-    start = {"lyot_rotation": 0.2}
-    problem = Problem(system, observed(light(), 1), as_opd_map(before()), start)
-    values = problem.optical_start(("lyot_rotation", "lyot_shift", "blur"))
-    assert values["lyot_rotation"].tolist() == [0.2]
-    assert values["lyot_shift"].tolist() == [0.01, 0.0]
-    assert values["blur"].tolist() == [0.026]

@@ -14,14 +14,12 @@ from astropy.time import Time
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import sources_of_references
-from pyklip_diffrender.linear.model import FrameRows
 from pyklip_diffrender.pattern import choose_systematics, pattern_for_visit
-from pyklip_diffrender.reduction import Preparation, ProductFolder, ReduceOptions, Visit, pipeline
+from pyklip_diffrender.reduction import Visit
 from pyklip_diffrender.reduction.visit import rough_settings, with_references
 from pyklip_diffrender.refinement import GaussNewton, align_frame, join_frames, refine
-from pyklip_diffrender.refinement.solver import ModePriors, exposure_sequences
+from pyklip_diffrender.refinement.solver import exposure_sequences
 from pyklip_diffrender.scene import Observation, Planet
-from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 SIZE, NPIX = 32, 64
@@ -266,28 +264,6 @@ def test_exposure_sequences():
     assert exposure_sequences([reference(0), rolled]) == [0, 1]
 
 
-def test_dithers_share_a_drift_and_have_one_of_their_own():
-    basis = default_basis(6.0, model().entrance)
-    drift = WavefrontPrior({"segment": 0.8, "texture": 0.5})
-    settings = replace(SETTINGS, drift=drift, drift_cycles=4.0)
-    frames = [*science(), reference(0), reference(1)]
-    every = ModePriors.of(settings, basis, frames)
-    assert every.blocks == ((0,), (1,), (2,), (3,))
-    shared = ModePriors.of(replace(settings, dither_drift=drift), basis, frames)
-    assert shared.blocks == ((0,), (1,), (2, 3), (2, 4))
-    assert len(shared.shape) == len(basis) + 5 * shared.drift
-    assert shared.names[-2:] == ("segment dither", "texture dither")
-    # Values by row and sums over rows are adjoint.
-    rng = torch.Generator().manual_seed(1)
-    part = FrameRows(torch.tensor([0, 1, 2, 3]), torch.tensor([[4, 5], [6, 7]]), first_mode=2)
-    unknowns = torch.randn(8, dtype=torch.float64, generator=rng)
-    rows = torch.randn(4, dtype=torch.float64, generator=rng)
-    assert torch.dot(part.of_unknowns(unknowns), rows) == pytest.approx(
-        float(torch.dot(unknowns, part.onto_unknowns(rows, 8))), rel=1e-12
-    )
-    assert part.of_unknowns(unknowns)[2] == unknowns[2] + unknowns[4] + unknowns[6]
-
-
 @pytest.mark.parametrize(("rms", "least", "most"), [(0.2e-9, 0.0, 0.9), (5e-9, 1.5, 5.0)])
 def test_the_size_of_the_drift_is_that_of_the_frames(rms, least, most):
     _, fit = alone()
@@ -296,40 +272,3 @@ def test_the_size_of_the_drift_is_that_of_the_frames(rms, least, most):
     joint = together(fit, [reference(k, drift=rms) for k in range(3)], settings)
     assert least < joint.scales["texture dither"] / 0.3 < most
     assert joint.scales["texture dither"] <= 4.0001 * 0.3
-
-
-def test_use_of_references_is_one_of_three():
-    assert ReduceOptions().references == "joint"
-    with pytest.raises(dr.errors.IncompatibleSetupError, match="joint, pattern, off"):
-        ReduceOptions(references="both")
-
-
-def test_a_resumed_reduction_knows_what_the_references_contributed(tmp_path, monkeypatch):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    # The second star is so faint that its frame is left out.
-    references = (reference(0), reference(1, brightness=0.01))
-    sequence = dr.Sequence("HD 1", science(), references)
-    options = ReduceOptions(size=SIZE, settings=SETTINGS, injections=2)
-    prepared = Preparation(sequence, sequence, model(), OPD, options, SETTINGS)
-    monkeypatch.setattr(pipeline, "recover_planets", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        prepared.run(products=ProductFolder(tmp_path))
-    before = dr.Detection.read(tmp_path)
-    for name in ("refine", "with_references", "detect"):
-        monkeypatch.setattr(pipeline, name, interrupted)
-    monkeypatch.setattr(pipeline, "recover_planets", lambda *_: None)
-    products = ProductFolder(tmp_path, resume=True)
-    result = prepared.run(products=products)
-    assert [each.use for each in result.visit.contributions] == ["joint", "left out"]
-    first, second = result.visit.contributions
-    assert first.flux == pytest.approx(2.0, rel=0.05)
-    assert "of the target's flux" in second.reason
-    assert np.isnan(second.chi2)
-    assert result.visit.gain > 1
-    assert [each.observation.reference for each in result.fit.frames] == [False, False, True]
-    np.testing.assert_array_equal(result.detection.candidates["snr"], before.candidates["snr"])
-    assert result.pattern == result.systematics.name == "the rolls themselves"
-    products.finish(result)
-    assert "1 of them in the likelihood" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -10,8 +10,7 @@ from astropy.io import fits as astropy_fits
 from astropy.table import QTable
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import wide_field, wide_search
-from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection import wide_field
 from pyklip_diffrender.detection.wide_search import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 
@@ -56,20 +55,6 @@ def searched():
 @pytest.fixture(scope="module")
 def wide(searched):
     return wide_field(*searched)
-
-
-def test_sources_that_a_joint_fit_leaves_faint_are_no_candidates():
-    """Peaks of a background above zero: each is above the threshold alone, not beside the rest."""
-    variance = np.array([1e-12, 1e-6, 1e-6])
-    sources = [
-        wide_search._Measurement(np.array([contrast, x, 0.0]), variance, 1.0)
-        for contrast, x in ((2e-5, 1.0), (-8e-6, 2.0), (4e-6, 3.0), (6e-6, 4.0))
-    ]
-    factor = ErrorFactor.constant(1.5)
-    # S/N 13, -5, 3 and 4; without frames nothing is fitted again.
-    kept = wide_search._significant((), sources, factor, 5.0)
-    assert kept == sources[:1]
-    assert wide_search._significant((), [], factor, 5.0) == []
 
 
 POINT = dr.Planet.from_offset(3e-5, -1.7, 1.4)

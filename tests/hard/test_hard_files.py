@@ -278,11 +278,3 @@ def test_reading_leaves_the_file_as_it_was(path):
                 hdus[0].data[:] = 0
         assert path.read_bytes() == content(kind)
         assert kind != "opd" or np.array_equal(read_opd(path).data, wavefront())
-
-
-def test_a_missing_dq_is_said(path):
-    hdus = calints()
-    del hdus["DQ"]
-    hdus.writeto(path, overwrite=True)
-    with pytest.warns(DiffrenderWarning, match=r"damaged\.fits: no DQ"):
-        Observation.from_fits(path)

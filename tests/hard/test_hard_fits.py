@@ -10,14 +10,11 @@ import pytest
 import torch
 from hard_cases import DTYPES
 from stability_fits import (
-    BACKGROUND,
     FITS,
     FLUX,
     NPIX,
     OFFSET,
     PRIOR,
-    SUCCESS,
-    error_of,
     fitted,
     model,
     noise,
@@ -27,15 +24,12 @@ from stability_fits import (
     star,
 )
 
-from pyklip_diffrender.detection.metrics import psnr, star_model_error, throughput
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.wavefront import FourierModes
 
 pytestmark = pytest.mark.hard
-
-SPOILT = {"zeros": lambda a: 0 * a, "transposed": lambda a: a.T, "1 % brighter": lambda a: 1.01 * a}
 
 
 ELSEWHERE = ("the start upside down", "the start transposed")
@@ -92,22 +86,6 @@ def test_a_float32_model_fits_as_well(case):
     # In the worst pixel: 1e-6 of a star whose brightest pixel has 690 sigma, and what a fit that
     # stops at a tolerance makes of it. A 1 % brighter star is 7 sigma away there.
     assert np.abs((single.frames[0].star - double.frames[0].star) / noise()).max() < 0.05
-
-
-@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
-def test_a_spoilt_star_is_no_success(spoil):
-    """What the fits are held to, and the metrics of the reports, notice all of them."""
-    wrong = spoil(star())
-    assert error_of(star() + BACKGROUND) < 1e-9
-    assert error_of(wrong + BACKGROUND) > 3 * SUCCESS
-    assert max(row.limit for row in FITS if row.ends == (Status.CONVERGED,)) < 3 * SUCCESS
-    middle = (11.5, 11.5)
-    assert star_model_error(wrong, star(), noise(), middle, 2, 10) > 3 * SUCCESS
-    assert star_model_error(star(), star(), noise(), middle, 2, 10) == 0
-    assert psnr(wrong, star(), middle) < 60 < psnr(star(), star(), middle)
-    kept = throughput(wrong, star(), noise(), (5.0, 8.0))
-    assert abs(kept - 1) > 0.009
-    assert throughput(star(), star(), noise(), (5.0, 8.0)) == pytest.approx(1, rel=1e-12)
 
 
 @pytest.mark.slow
@@ -174,11 +152,3 @@ def test_masked_pixels_of_a_finished_observation_change_nothing_bitwise(junk, dt
     assert dirty.frames[0].star.tobytes() == clean.frames[0].star.tobytes()
     assert dirty.chi2_per_pixel == clean.chi2_per_pixel
     assert np.isfinite(dirty.frames[0].star).all()
-
-
-def test_masked_nan_of_a_finished_observation_change_nothing():
-    frame = observed(star())
-    valid = np.random.default_rng(4).random(frame.data.shape) > 0.05
-    spoilt = replace(frame, data=np.where(valid, frame.data, np.nan), valid=valid)
-    clean = fitted(replace(frame, valid=valid), max_iterations=3)
-    assert fitted(spoilt, max_iterations=3).wavefront.tobytes() == clean.wavefront.tobytes()

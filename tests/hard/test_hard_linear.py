@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -25,8 +24,6 @@ GRID = PupilGrid(N, JWST_DIAMETER, (3, 44), (5, 47))
 ONTO = PupilGrid(N, JWST_DIAMETER, (6, 40), (8, 45))
 LIMITS = {torch.float64: 1e-10, torch.float32: 1e-4}
 """float32 holds 6e-8 a product; thousands are added up, with signs."""
-
-Stage = Callable[[torch.Tensor], torch.Tensor]
 
 
 def model(dtype):

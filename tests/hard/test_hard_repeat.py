@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from astropy.io import fits
-from hard_cases import NPIX, small, system, wavefront, worst
+from hard_cases import small, system, wavefront, worst
 from stability_fits import error_of, fitted, noise, observed, star
 
-from pyklip_diffrender.bridges.image_masks import FourierMask
 from pyklip_diffrender.io import open_fits, write_fits
-from pyklip_diffrender.optics import JWST_DIAMETER, Cache, Position, PupilGrid, Wavefront
 from pyklip_diffrender.scene import Planet, Scene, simulate
 from pyklip_diffrender.wavefront import random_drift, random_opd
 
@@ -90,38 +87,6 @@ def test_eight_callers_of_one_model_get_what_one_gets(dtype):
     assert worst(expected[1], expected[0]) > 0.1
 
 
-def test_two_callers_of_a_padded_mask_at_two_wavelengths():
-    """The second caller stores its lattice between the first one's store and read."""
-    other_is_done, first_has_stored = threading.Event(), threading.Event()
-    short, long = 4.0e-6, 5.0e-6
-
-    class Interrupted(Cache[torch.dtype, tuple[Position, torch.Tensor]]):
-        def __setitem__(self, key, made):
-            super().__setitem__(key, made)
-            if made[0] == (("wavelength", short),):
-                first_has_stored.set()
-                other_is_done.wait(5)
-
-    def transmission(wavelength):
-        return torch.full((16, 16), wavelength * 1e6, dtype=torch.float64)
-
-    grid = PupilGrid.full(8, JWST_DIAMETER)
-    field = torch.ones(8, 8, dtype=torch.complex128)
-    mask = FourierMask(transmission, 2, 8, JWST_DIAMETER, "padded")
-    mask._latest = Interrupted()
-
-    def call(wavelength):
-        return mask.apply(Wavefront(field, wavelength, grid), {}, grid).field
-
-    with ThreadPoolExecutor(2) as pool:
-        first = pool.submit(call, short)
-        assert first_has_stored.wait(5)
-        second = pool.submit(call, long)
-        np.testing.assert_allclose(second.result().real, 5.0, rtol=1e-12)
-        other_is_done.set()
-        np.testing.assert_allclose(first.result().real, 4.0, rtol=1e-12)
-
-
 @pytest.mark.parametrize("suffix", [".fits", pytest.param(".fits.gz", marks=pytest.mark.slow)])
 def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(tmp_path, suffix, killed):
     """Half of the new file is on the disk when the process is killed."""
@@ -149,10 +114,3 @@ def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(tmp_path,
     with open_fits(path) as hdus:
         assert hdus[0].data.shape == (70, 70)
         assert not hdus[0].data.any()
-
-
-def test_npix_of_the_shared_wavefront():
-    """Guards the comparisons above: not flat, not symmetric."""
-    map_ = wavefront().numpy()
-    assert map_.shape == (NPIX, NPIX)
-    assert min(np.abs(map_ - t).max() for t in (map_.T, map_[::-1], map_[:, ::-1])) > 1e-8

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from hard_cases import DTYPES, NPIX, small, system, wavefront
+from hard_cases import DTYPES, small, system, wavefront
 from stability_fits import fitted, observed, star
 
 from pyklip_diffrender.errors import (
@@ -16,26 +15,11 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     NonFiniteError,
     NoValidPixelsError,
-    ShapeError,
 )
-from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.linear import coarse_copy
 from pyklip_diffrender.scene import Observation, Scene, simulate
 from pyklip_diffrender.wavefront import as_opd_map
 
 pytestmark = pytest.mark.hard
-
-
-def test_another_filter_lists_those_that_there_are():
-    with pytest.raises(IncompatibleSetupError, match=r"'F090W'.*F182M.*F335M.*F444W.*F480M"):
-        nircam_coronagraph("F090W")
-
-
-def test_another_mask_lists_those_that_there_are():
-    with pytest.raises(IncompatibleSetupError, match=r"'MASK999R'.*MASK210R.*MASKLWB"):
-        nircam_coronagraph("F444W", image_mask="MASK999R")
-    with pytest.raises(IncompatibleSetupError, match=r"'MASKOFF'.*MASKRND.*MASKBAR"):
-        nircam_coronagraph("F444W", pupil_mask="MASKOFF")
 
 
 def test_a_frame_of_another_filter_is_refused():
@@ -115,23 +99,6 @@ def test_what_a_fit_may_try_does_not_warn():
     assert small()(1e-12 * wavefront(rms=1.0).numpy()).isfinite().all()
 
 
-def test_bare_nanometres_warn_in_a_fit():
-    with pytest.warns(DiffrenderWarning, match="in nm it would be plausible"):
-        fitted(observed(star()), np.asarray(wavefront()) * 1e9, max_iterations=1)
-
-
-def test_an_empty_map_is_refused():
-    with pytest.raises(ShapeError):
-        as_opd_map(np.zeros((0, 0)))
-
-
-def test_copies_for_derivatives_are_no_coarser_than_the_field_allows():
-    """320 pixels are 142 lambda/D: 128 samples would repeat the star inside them."""
-    wide = small(npix=512, fov_pixels=320)
-    assert coarse_copy(wide, 128).npix == 256
-    assert coarse_copy(small(npix=512), 128).npix == 128
-
-
 def test_a_field_wider_than_the_pupil_resolves_is_refused():
     """32 samples repeat the image after 32 lambda/D, 4.5 arcsec: the field has 5."""
     with pytest.raises(IncompatibleSetupError, match="npix"):
@@ -144,8 +111,3 @@ def test_nothing_left_to_fit_is_an_error():
         fitted(replace(frame, valid=np.zeros_like(frame.valid)))
     with pytest.raises(NoValidPixelsError):
         Observation.from_arrays(np.full((4, 4), np.nan), np.ones((4, 4)), pixelscale=0.06)
-
-
-def test_the_size_of_a_map_is_compared():
-    with pytest.raises(ShapeError, match=f"npix={NPIX // 2}"):
-        small()(torch.zeros(NPIX // 2, NPIX // 2))
