@@ -13,7 +13,7 @@ from astropy.time import Time
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints, starlight
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure, beginning, image_mask
+from pyklip_diffrender.scene.exposure import CatalogueStar, beginning, image_mask
 
 
 @pytest.fixture
@@ -251,15 +251,6 @@ def test_a_roll_without_its_angle_is_excluded(folder, card, value):
     sequence = dr.Sequence.from_files(folder)
     assert as_before(sequence, folder)
     assert card in reasons(sequence)["x.fits"]
-
-
-def test_the_sum_of_angles_stands_for_one_of_them():
-    header = fits.Header({"ROLL_REF": 70.0, "PA_APER": 70.05})
-    assert Exposure.of(header, "a.fits").position_angle == 70.05
-    header["V3I_YANG"] = 0.051
-    assert Exposure.of(header, "a.fits").position_angle == 70.051
-    del header["ROLL_REF"]
-    assert Exposure.of(header, "a.fits").position_angle is None
 
 
 @pytest.mark.parametrize(

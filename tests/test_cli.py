@@ -588,16 +588,6 @@ def test_a_wrong_configuration_is_a_usage_error(tmp_path, capsys, content, words
     assert not star.exists()
 
 
-def test_checks_of_options_name_the_configuration_that_they_may_come_from(tmp_path, capsys):
-    config = tmp_path / "run.toml"
-    config.write_text("[detect]\nthreshold = -3.0\n")
-    arguments = ["detect", "x", "-o", "y", "--opd", "z"]
-    assert main([*arguments, "--config", str(config)]) == 2
-    assert f"options are also taken from {config}" in capsys.readouterr().err
-    assert main([*arguments, "--threshold", "-3"]) == 2
-    assert "taken from" not in capsys.readouterr().err
-
-
 def test_a_missing_map_is_answered_with_what_there_is(capsys):
     for command in (
         ["detect", "x", "-o", "y"],

@@ -48,8 +48,6 @@ WHERE = Planet(0.0, 0.7, 60.0)
 FAINT = replace(WHERE, contrast=2e-6)
 """Below the S/N at which the star is refined again."""
 
-NOT_LOOKING = {"companions_if_stalled": False, "grow_basis": False, "coarse_first": False}
-"""With a model error that is allowed for, fits do not look for companions by themselves."""
 
 Image = NDArray[np.float64]
 
@@ -417,20 +415,6 @@ def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large):
     assert stated > 1.1 * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
 
 
-@pytest.mark.slow
-def test_errors_of_a_companion_in_the_derivatives_count_star_and_image_once(large):
-    found = large.detected(7, replace(WHERE, contrast=1e-3))
-    (row,) = found.candidates
-    assert len(found.fits[0].bright_companions) == 1
-    assert row["contrast_error"] == pytest.approx(own_error(found))
-    # They are in the error of the linear model, which is larger than for a source whose image and
-    # star are known.
-    distance = np.hypot(*np.moveaxis(found.grid - WHERE.offset, -1, 0))
-    known = float(found.photon_error[np.unravel_index(distance.argmin(), distance.shape)])
-    assert row["contrast_error"] > 1.2 * known
-    assert abs(row["contrast"] - 1e-3) < 4 * row["contrast_error"]
-
-
 def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_extended(
     world, monkeypatch, caplog
 ):
@@ -457,19 +441,6 @@ def test_two_planets_closer_than_a_beam_are_fitted_together(large):
         contrast = float(found.sources.contrasts[nearest])
         assert abs(contrast - planet.contrast) < 4 * float(found.sources.errors[nearest, 0])
         assert contrast == pytest.approx(planet.contrast, rel=0.3)
-
-
-@pytest.mark.slow
-def test_a_bright_planet_is_measured_right_after_the_star_is_refined_again(large):
-    planet = replace(WHERE, contrast=1e-3)
-    fit = large.fitted(13, planet, **NOT_LOOKING)
-    assert not len(fit.companions)
-    found = dr.detect(fit)
-    assert found.fits[0] is not fit
-    assert len(found.fits[0].companions) == 1
-    assert float(found.candidates["contrast"][0]) == pytest.approx(1e-3, rel=0.02)
-    away = radius(found) > 0.25
-    assert np.abs(found.residual_snr[away]).max() < 6
 
 
 @pytest.mark.slow

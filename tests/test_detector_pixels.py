@@ -7,12 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-import torch
 from astropy.io import fits
 from scipy.ndimage import fourier_shift, gaussian_filter
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pattern import MeasuredPattern, combine_patterns, place_on_detector
 from pyklip_diffrender.scene.star_place import measured_offset
@@ -253,26 +251,6 @@ def test_the_library_leaves_out_the_target_and_what_it_does_not_cover(tmp_path):
 @cache
 def system():
     return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-
-
-def test_templates_of_rolled_frames_stand_where_the_planet_is():
-    opd = dr.random_opd(1, npix=128)
-    frames = [
-        replace(dr.simulate(system(), dr.Scene(), opd, seed=seed), position_angles=np.array([roll]))
-        for seed, roll in ((1, 0.0), (2, 10.0))
-    ]
-    fit = dr.refine(system(), frames, opd, settings=dr.GaussNewton(cycles=4))
-    templates = Templates(fit, fit.frames[0])
-    rows, columns = np.array([6, 16, 25]), np.array([16, 28, 8])
-    images = templates.at_pixels(rows, columns)
-    exact = templates.at(torch.from_numpy(templates.grid[rows, columns]))
-    for k, least in ((0, 0.9999), (1, 0.985)):
-        one, other = images[k].double().flatten(1), exact[k].flatten(1)
-        overlap = (one * other).sum(1) / (one.norm(dim=1) * other.norm(dim=1))
-        assert float(overlap.min()) > least
-    # Outside the second frame there is no light.
-    corner = templates.at_pixels(np.array([31]), np.array([31]))
-    assert float(corner[1].abs().max()) == 0 < float(corner[0].max())
 
 
 @pytest.mark.parametrize("moved", [(0.3, 1.2), None], ids=["seen", "not there"])

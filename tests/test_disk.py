@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 
@@ -18,10 +17,7 @@ from scipy.optimize import nnls
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import disk as module
 from pyklip_diffrender.detection.templates import groups_of
-from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.pyklip_backend import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.output_files import ProductImages
-from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.wavefront import random_drift
 
 ROLLS = (20.0, 32.0)
@@ -254,43 +250,3 @@ def test_limits_are_those_of_the_pixels_that_are_left():
     assert 5 < table["planets"][0] < 8  # Two of twelve are on the edge.
     with pytest.raises(IncompatibleSetupError, match=r"without_limits: got the shape \(3,\)"):
         dr.detect(fit, without_limits=np.zeros(3, dtype=bool))
-
-
-@pytest.mark.slow
-def test_products_of_pyklip_keep_a_ring():
-    """The setting `disk` leaves the ring in the frames, and in the image of the sky."""
-    frames, rings = rolls(BRIGHTNESS)
-    observation = replace(
-        frames[0],
-        data=np.concatenate([frame.data for frame in frames]),
-        error=np.concatenate([frame.error for frame in frames]),
-        valid=np.concatenate([frame.valid for frame in frames]),
-        center=np.concatenate([frame.center for frame in frames]),
-        position_angles=np.array(ROLLS),
-    )
-    settings = DiffrenderSettings(
-        model=dr.nircam_coronagraph("F444W", **OPTIONS),
-        fit=dr.GaussNewton(cycles=10, response_npix=64),
-        keep_detected=False,
-    )
-    amounts = {}
-    for fits_disk in (False, True):
-        asked = replace(settings, disk=fits_disk)
-        advice = pytest.warns(DiffrenderWarning, match="disk=True for a star with a disk")
-        with nullcontext() if fits_disk else advice:
-            subtraction = subtract_by_refinement(observation, dr.random_opd(1, npix=128), asked)
-        reduction = subtraction.reduction
-        assert (reduction.disk is not None) == fits_disk
-        residuals = observation.data - subtraction.star
-        amounts["subtracted", fits_disk] = amount(np.nan_to_num(residuals[0]), rings[0])
-        images = ProductImages(subtraction)
-        for image in ("cleaned", "flux"):
-            shown = residuals.copy()
-            images.put_into(shown, image)
-            amounts[image, fits_disk] = amount(np.nan_to_num(shown[0]), rings[0])
-    assert amounts["subtracted", False] < 0.2
-    assert amounts["subtracted", True] == pytest.approx(1.0, abs=0.1)
-    # Its light, which the data of the fit do not have, is in the images of the sky again, without
-    # that of the side lobes of its parts.
-    assert amounts["cleaned", True] == pytest.approx(0.6, abs=0.1)
-    assert amounts["flux", True] == pytest.approx(0.6, abs=0.1)

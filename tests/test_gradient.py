@@ -15,7 +15,6 @@ from pyklip_diffrender.refinement.solver import (
     ModelDerivatives,
     Solver,
     StepState,
-    accurate_step,
     conjugate_gradients,
     linearise,
 )
@@ -175,43 +174,6 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames):
     assert (curved[0] - expected).norm() < 2e-3 * expected.norm()
     assert (curved[1] - expected).norm() < 2e-3 * expected.norm()
     assert (products[0] - expected).norm() > 0.1 * expected.norm()
-
-
-@pytest.mark.slow
-def test_an_accurate_step_ends_where_that_of_the_model_does():
-    """In as many iterations as are needed, whatever the coarse copy that preconditions them."""
-    solver, state = solver_of(1)
-    same = of_the_model_itself(solver)
-    weights = solver.objective.errors(state, 0.01, 4.0)
-    priors = solver.priors_of(solver.settings)
-    deviation = solver.prior_deviation(state.unknowns, priors)
-    coarse, fine = (
-        linearise(each.objective, state, 0.01, len(BASIS), 4.0) for each in (solver, same)
-    )
-    derivatives = ModelDerivatives(solver.objective, state, weights)
-    # Equations of the starting values precondition as well.
-    start = solver.objective.at(state.unknowns, state.unknowns.initial())
-    earlier = linearise(solver.objective, start, 0.1, len(BASIS), 4.0)
-    direct = same._solve(state.unknowns, fine, priors).step - fine.current
-    steps = []
-    for equations in (coarse, earlier):
-        step, settled = accurate_step(
-            derivatives,
-            equations.curvature,
-            fine.current,
-            deviation,
-            enough=0.0,
-            iterations=20,
-            sufficient=0.0,
-        )
-        assert not settled  # Every iteration lowers it, if only by a little.
-        steps.append(step)
-    too_coarse = solver._solve(state.unknowns, coarse, priors).step - coarse.current
-    errors = same._solve(state.unknowns, fine, priors, errors=True).variance.sqrt()
-    assert (direct / errors).norm() > 10
-    for step in steps:
-        assert ((step - direct) / errors).norm() < 0.3
-    assert ((too_coarse - direct) / errors).norm() > 5
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 3])

@@ -268,18 +268,6 @@ def test_the_mean_of_faint_frames_is_not_biased():
     assert 0.9 < pulls.std() < 1.1
 
 
-def test_the_real_frames_are_read(shared_data):
-    got = Observation.from_fits(shared_data / "hip65426_f444w_calints.fits.gz")
-    assert got.data.shape == (2, 320, 320)
-    assert got.filter == "F444W"
-    assert got.unit == u.MJy / u.sr
-    assert got.pixelscale[0] == pytest.approx(0.0624, rel=0.01)
-    # The brightest pixel of the occulted star lies within a beam of its position.
-    small = got.combined().cutout(41)
-    y, x = np.unravel_index((small.data * small.valid)[0].argmax(), small.shape)
-    assert np.hypot(*(np.array([x, y]) - small.center[0])) < 12
-
-
 def test_frames_of_another_instrument_are_refused_before_a_fit():
     ones = np.ones((8, 8))
     header = fits.Header({"INSTRUME": "MIRI"})

@@ -239,19 +239,6 @@ def test_extended_light_is_told_by_the_arrangement(places, reason):
     assert bool(looks_extended(sources(np.array(places)), 0.14, 2.4)) == bool(reason)
 
 
-@pytest.mark.parametrize("count", [2, 3, 5, 8])
-def test_unrelated_sources_rarely_look_extended(count):
-    """At most 1 % for each of the two criteria, counted in 500 draws."""
-    rng, edge = np.random.default_rng(count), 2.4
-    hits = 0
-    for _ in range(500):
-        radius, angle = edge * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
-        drawn = sources(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
-        hits += bool(looks_extended(drawn, 0.14, edge))
-    # 10 are expected at most, with a standard deviation of 3.
-    assert hits <= 20
-
-
 @pytest.mark.parametrize(
     ("value", "error", "text"),
     [
@@ -324,20 +311,6 @@ def test_calibrated_frames_have_flux_densities_on_the_page():
     words = Tags(page(summary, ReportPictures())).words
     assert "0.41 ± 0.05 Jy, from its diffracted light" in words
     assert scientific(1.2e-4, 1e-5) in words
-
-
-def test_pixels_that_the_fit_left_out_are_named():
-    whole = reduction()
-    frame = whole.fit.frames[0]
-    valid = frame.observation.valid.copy()
-    valid[0, 3, 5] = False
-    fitted = replace(frame, observation=replace(frame.observation, valid=valid))
-    summary = summarise(replace(whole, fit=replace(whole.fit, frames=(fitted,))))
-    (place,) = summary["frames"][0]["bad_pixels"]
-    assert place == pytest.approx(frame.grid[3, 5], abs=6e-4)
-    assert f"({place[0]:+.2f}, {place[1]:+.2f})" in page(summary, ReportPictures())
-    assert summarise(whole)["frames"][0]["bad_pixels"] == []
-    assert "left out because" not in page(summarise(whole), ReportPictures())
 
 
 def test_every_picture_has_words_and_nothing_is_loaded(folder):
@@ -426,39 +399,6 @@ def test_images_have_north_up():
     # Four standard deviations.
     (circled,) = overview._places
     assert np.hypot(*(circled - PLANET.offset)) < 0.05
-
-
-@pytest.mark.parametrize("place", [(-0.4, 0.2), (0.5, 0.5)])
-def test_throughput_is_what_the_fit_of_the_star_leaves_of_a_faint_source(place):
-    """A frame with and without a source of S/N 3, fitted as if there were none.
-
-    The scales of the prior are fixed: where they follow the evidence, they change a little, too.
-    """
-    whole = reduction(planet=False)
-    images, before = SkyImages(whole), whole.detection.fits[0].frames[0]
-    light = before.flux * before.model(before.opd, place).detach().numpy()
-    weight = before.observation.error[0] ** -2.0
-    light *= 3 / np.sqrt((weight * light**2).sum())
-    prior = dr.WavefrontPrior(whole.fit.scales, fit_scales=False)
-    settings = dr.GaussNewton(cycles=6, max_companions=0, prior=prior)
-    without, star = (
-        dr.refine(
-            before.model,
-            replace(before.observation, data=before.observation.data + part * light),
-            whole.fit.initial,
-            settings=settings,
-        )
-        .frames[0]
-        .star
-        for part in (0, 1)
-    )
-    left = light - (star - without)
-    kept = (weight * left * light).sum() / (weight * light**2).sum()
-    distance = np.hypot(*np.moveaxis(images.grid - images.to_sky @ place, -1, 0))
-    nearest = np.unravel_index(distance.argmin(), distance.shape)
-    # Linear theory, and the nearest pixel of an image that was turned.
-    assert kept == pytest.approx(images.throughput[nearest], abs=0.06)
-    assert 0.1 < kept < 0.95
 
 
 def test_images_of_the_sky_are_written_with_coordinates(tmp_path):

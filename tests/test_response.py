@@ -241,18 +241,6 @@ def test_derivatives_behind_a_bar_are_as_exact_as_behind_a_round_mask(mask):
     assert difference.norm() < 0.01 * exact.image(fields, {}).norm()
 
 
-def test_coarse_copy_is_coarser_or_the_model_itself():
-    model = system()
-    coarse = coarse_copy(model, 64)
-    assert coarse.npix == 64
-    assert coarse.dtype == torch.float32
-    assert coarse.detector.shape == model.detector.shape
-    assert coarse.bandpass == model.bandpass
-    assert coarse_copy(model, 256) is model
-    same = coarse_copy(model, 100)  # 256 pixels do not divide into 100.
-    assert (same.npix, same.dtype) == (256, torch.float32)
-
-
 @pytest.fixture
 def linear():
     """A whitened problem: 2 parameters, one without a prior, and modes of two kinds."""

@@ -95,17 +95,6 @@ def test_contrasts_refer_to_the_catalogues_star(fit, share):
 
 
 @pytest.mark.slow
-def test_a_prior_that_agrees_changes_nothing_but_the_error(fit):
-    before = dr.detect(fit)
-    after = dr.detect(with_star_flux(fit, before.sky.star[0], 0.03))
-    (then,), (now,) = before.candidates, after.candidates
-    assert now["contrast"] == pytest.approx(then["contrast"], rel=2e-3)
-    assert now["contrast"] == pytest.approx(TRUTH, rel=4 / now["snr"])
-    assert now["contrast_error"] / now["contrast"] == pytest.approx(0.03, rel=0.02)
-    assert then["contrast_error"] / then["contrast"] == pytest.approx(0.1, rel=0.02)
-
-
-@pytest.mark.slow
 def test_the_stars_flux_is_the_stated_one_wherever_it_is_shown(fit, tmp_path):
     """Frames that pull at the star, because they determine its flux better than it is held."""
     before = dr.detect(fit)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from datetime import date
@@ -279,39 +277,6 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path):
     assert list(run_survey(config, output, stub)["status"]) == ["finished"] * 6
     assert (folder / "report.html").exists()
     assert hidden(output) == []
-
-
-def test_what_another_survey_published_meanwhile_stays(tmp_path):
-    (job,) = planned(inputs(tmp_path / "data", 1))
-    jobs = folders.prepare(tmp_path / "out")
-    # In a folder of the same name, because its inputs are the same.
-    rival = replace(job, opd="rival")
-
-    def work(inner, folder):
-        if inner.opd != "rival":
-            assert execution.run_job(rival, jobs, work)["status"] == "finished"
-        return stub(inner, folder)
-
-    assert execution.run_job(job, jobs, work)["status"] == "finished"
-    record = folders.read_record(jobs / job.folder)
-    assert record["job"]["opd"] == "rival"
-    assert hidden(tmp_path / "out") == []
-
-
-def test_only_what_dead_processes_left_is_removed(tmp_path):
-    jobs = folders.prepare(tmp_path)
-    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
-        pass
-    mine = folders.staging(jobs, "a" * 64)
-    left = jobs / mine.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-")
-    elsewhere = left.with_name(f"{left.name}x")
-    for each in (left, elsewhere):
-        each.mkdir()
-        (each / "half").write_text("half")
-    # Another machine may run this job, whatever its clock or ours says.
-    os.utime(elsewhere, (0, 0))
-    folders.clean(jobs)
-    assert sorted(jobs.iterdir()) == sorted([mine, elsewhere])
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])

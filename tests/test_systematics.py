@@ -184,21 +184,6 @@ def test_the_error_of_a_pattern_counts_as_noise():
     assert row["contrast_error"] > 1.2 * exact["contrast_error"]
 
 
-@pytest.mark.slow
-def test_the_pattern_follows_the_star_over_the_detector():
-    """Where the pattern was not measured its standard deviation counts."""
-    shift = (3, -2)
-    there = np.roll(pattern(), shift[::-1], axis=(0, 1))
-    center = (MIDDLE[0] + shift[0], MIDDLE[1] + shift[1])
-    spoilt = observed(light(shift=shift) * (1 + there) + light(PLANET, shift), 52, center=center)
-    fit = fitted(spoilt, known())
-    assert fit.status is Status.CONVERGED
-    assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.13)
-    assert fitted(replace(spoilt, center=np.array([MIDDLE])), known()).reduced_chi2 > 30
-    row = dr.measure(fit, [PLANET.offset])[0]
-    assert abs(row["contrast"] - PLANET.contrast) < 3 * row["contrast_error"]
-
-
 def test_frames_fitted_together_have_the_pattern_each_at_its_star():
     shifts = ((0, 0), (2, 1))
     frames = [

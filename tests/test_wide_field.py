@@ -218,19 +218,6 @@ def test_a_wide_field_is_written_and_drawn(wide, tmp_path):
 
 
 @pytest.mark.slow
-def test_frames_hardly_larger_than_the_fitted_square(searched):
-    detection, frames = searched
-    small = [frame.cutout(FITTED + 20) for frame in frames]
-    with pytest.raises(IncompatibleSetupError, match=f"68 x 68 pixels.*more than {FITTED + 32}"):
-        wide_field(detection, small)
-    # Nowhere 2 arcsec from the star, the background is that of the outer pixels.
-    (fit,) = detection.fits
-    residual = WholeFrame(fit.frames[0], frames[0].cutout(FITTED), 0.0, np.zeros((0, 3))).residual
-    assert np.isfinite(residual).all()
-    assert abs(np.median(residual)) < 0.2 * np.std(residual)
-
-
-@pytest.mark.slow
 def test_other_frames_are_refused(searched):
     detection, frames = searched
     with pytest.raises(IncompatibleSetupError, match="expected those of the fit"):
