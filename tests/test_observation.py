@@ -7,6 +7,7 @@ import pytest
 import torch
 from astropy import units as u
 from astropy.io import fits
+from small_files import AREA, calints
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import (
@@ -22,33 +23,6 @@ from pyklip_diffrender.linear.response import coarse_copy
 from pyklip_diffrender.optics.fast_path import finest_spacing
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.observation import Observation
-
-AREA = 0.00396
-"""arcsec^2 of a pixel."""
-
-
-def calints(path, data, error=None, quality=None, *, leave_out=(), **changes):
-    """A small calints file, headers as the JWST pipeline writes them."""
-    primary = {"FILTER": "F444W", "DATE-BEG": "2022-07-30T02:03:04.5", "INSTRUME": "NIRCAM"}
-    science = {
-        "BUNIT": "MJy/sr", "PIXAR_A2": AREA, "CRPIX1": 6.0, "CRPIX2": 5.0, "ROLL_REF": 100.0,
-        "V3I_YANG": -0.5, "VPARITY": -1,
-    }  # fmt: skip
-    hdus = [fits.PrimaryHDU()]
-    error = np.ones_like(data) if error is None else error
-    quality = np.zeros(data.shape, dtype=np.uint32) if quality is None else quality
-    for name, array in (("SCI", data), ("ERR", error), ("DQ", quality)):
-        if name not in leave_out:
-            hdus.append(fits.ImageHDU(array, name=name))
-    for header, entries in ((hdus[0].header, primary), (hdus[1].header, science)):
-        for key, value in entries.items():
-            value = changes.get(key.replace("-", "_"), value)
-            if value is not None:
-                header[key] = value
-    for key in set(changes) - {k.replace("-", "_") for k in (*primary, *science)}:
-        hdus[1].header[key.replace("_", "-")] = changes[key]
-    fits.HDUList(hdus).writeto(path)
-    return path
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import small_files
 from astropy import units as u
 from astropy.io import fits
 
@@ -66,25 +67,14 @@ def reference_fit():
 
 
 def calints(path, star, roll, date, **cards):
-    rng = np.random.default_rng(len(star))
-    primary = fits.PrimaryHDU()
+    data = np.random.default_rng(len(star)).normal(10, 1, (2, 24, 24)).astype("f4")
     defaults = {
-        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "FILTER": "F444W", "PUPIL": "MASKRND",
-        "CORONMSK": "MASKA335R", "SUBARRAY": "SUB320A335R", "DETECTOR": "NRCALONG",
-        "TARGPROP": star, "DATE-BEG": date, "IS_PSF": False,
+        "TELESCOP": "JWST", "PUPIL": "MASKRND", "CORONMSK": "MASKA335R",
+        "SUBARRAY": "SUB320A335R", "DETECTOR": "NRCALONG", "IS_PSF": False,
     }  # fmt: skip
-    for key, value in {**defaults, **cards}.items():
-        primary.header[key] = value
-    science = fits.ImageHDU(rng.normal(10, 1, (2, 24, 24)).astype("f4"), name="SCI")
-    for key, value in {
-        "BUNIT": "MJy/sr", "PIXAR_A2": 0.0039, "CRPIX1": 13.0, "CRPIX2": 12.0,
-        "ROLL_REF": roll, "V3I_YANG": 0.05, "VPARITY": -1,
-    }.items():  # fmt: skip
-        science.header[key] = value
-    error = fits.ImageHDU(np.ones((2, 24, 24), "f4"), name="ERR")
-    quality = fits.ImageHDU(np.zeros((2, 24, 24), "i4"), name="DQ")
-    fits.HDUList([primary, science, error, quality]).writeto(path)
-    return path
+    primary = {**defaults, "TARGPROP": star, "DATE-BEG": date, **cards}
+    place = {"CRPIX1": 13.0, "CRPIX2": 12.0, "PIXAR_A2": 0.0039, "V3I_YANG": 0.05}
+    return small_files.calints(path, data, primary=primary, ROLL_REF=roll, **place)
 
 
 @pytest.fixture
