@@ -18,29 +18,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "pyklip_diffrender"
 
 PACKAGES = (
-    "_version",
-    "errors",
-    "parameters",
-    "io",
-    "drawing",
-    "archive",
-    "optics",
-    "instrument",
-    "wavefront",
-    "scene",
-    "linear",
-    "refinement",
-    "pattern",
-    "detection",
-    "imaging",
-    "reduction",
-    "pyklip_backend",
-    "spaceklip",
-    "demo",
-    "surveys",
-    "cli",
-    "bridges",
-)
+    "_version", "errors", "parameters", "io", "drawing", "archive", "optics", "instrument",
+    "wavefront", "scene", "linear", "refinement", "pattern", "detection", "imaging",
+    "reduction", "pyklip_backend", "spaceklip", "demo", "surveys", "cli", "bridges",
+)  # fmt: skip
 """Top-level modules and packages in order: each imports only from those before it.
 
 Imports in functions and under TYPE_CHECKING count. One of them goes the other way: see `LATE`.
