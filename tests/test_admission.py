@@ -546,8 +546,13 @@ def real_roll(shared_data, path, change):
 
 @pytest.mark.parametrize(
     ("contrast", "separation", "angle"),
-    [(1e-3, 0.8, 10.0), (1e-3, 1.3, 100.0), (0.01, 0.5, 300.0), (0.03, 4.0, 40.0),
-     (0.1, 0.3, 70.0), (0.1, 1.0, 200.0), (0.1, 1.5, 20.0), (0.1, 2.5, 250.0)],
+    [
+        (1e-3, 1.3, 100.0), (0.01, 0.5, 300.0), (0.1, 1.0, 200.0),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in (
+            (1e-3, 0.8, 10.0), (0.03, 4.0, 40.0), (0.1, 0.3, 70.0), (0.1, 1.5, 20.0),
+            (0.1, 2.5, 250.0),
+        )),
+    ],
 )  # fmt: skip
 def test_a_neighbour_is_not_taken_for_the_star(shared_data, tmp_path, contrast, separation, angle):
     path = real_roll(shared_data, tmp_path / "a.fits", neighbour(contrast, separation, angle))
@@ -622,7 +627,7 @@ def empty(path):
         hdus.writeto(path, overwrite=True)
 
 
-@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 4])
 @pytest.mark.parametrize("spoil", [without("SCI"), without("ERR"), truncated, product, klip, empty])
 @pytest.mark.parametrize("cards", [OTHER, {"FILTER": "F356W"}, {"TARGPROP": "HD 9"}])
 def test_files_that_cannot_be_used_do_not_vote(folder, spoil, count, cards):

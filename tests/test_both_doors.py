@@ -306,7 +306,10 @@ def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, c
     assert {path.name: opened[path.name] for path in files} == {path.name: 2 for path in files}
 
 
-@pytest.mark.parametrize("visits", ["001 002", "003 004", "005 006"])
+@pytest.mark.parametrize(
+    "visits",
+    ["003 004", *(pytest.param(each, marks=pytest.mark.slow) for each in ("001 002", "005 006"))],
+)
 @pytest.mark.parametrize("exposure", ["03106", "03107"], ids=["F444W", "F356W"])
 def test_real_pairs_are_the_same_in_both_doors(
     exposure, visits, shared_data, tmp_path, calls,

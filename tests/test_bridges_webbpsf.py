@@ -195,10 +195,10 @@ def test_zernikes_add_to_the_internal_wavefront(nircam):
     [
         ("star_offset", [0.013, -0.021], 1e-4),
         ("lyot_shift", [0.0031, -0.0052], 1e-6),
-        ("lyot_rotation", [0.31], 1e-4),
+        pytest.param("lyot_rotation", [0.31], 1e-4, marks=pytest.mark.slow),
         ("si_zernikes", None, 1e-10),
-        ("detector_shift", [0.011, 0.023], 1e-4),
-        ("blur", [0.02], 1e-4),
+        pytest.param("detector_shift", [0.011, 0.023], 1e-4, marks=pytest.mark.slow),
+        pytest.param("blur", [0.02], 1e-4, marks=pytest.mark.slow),
         ("opd", None, 1e-10),
     ],
 )

@@ -138,7 +138,7 @@ ROWS = [
 ]
 
 
-@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("backwards", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("date", "choice", "names"),
     [

@@ -263,7 +263,9 @@ def test_free_fluxes_at_one_place_follow_chi_bar_squared(count):
         assert Family(None, stack, 1.0).expected(level) == pytest.approx(rare, rel=1e-9)
 
 
-@pytest.mark.parametrize("names", [("F444W", "F356W"), ("F444W", "F356W", "F210M")])
+@pytest.mark.parametrize(
+    "names", [("F444W", "F356W"), pytest.param(("F444W", "F356W", "F210M"), marks=pytest.mark.slow)]
+)
 def test_noise_has_as_many_peaks_as_expected(names):
     """Fine maps of noise: the share with a peak above a level, for black bodies and free fluxes."""
     count, side = 1000, 40
@@ -357,7 +359,7 @@ def test_orbits_allow_a_bound_source_to_move():
 @pytest.mark.slow
 def test_false_candidates_are_as_rare_as_those_of_a_single_search():
     """Thresholds lowered to 3.6, so that many searches of noise have a candidate."""
-    count, level = 150, 3.6
+    count, level = 80, 3.6
     false = single = 0
     for seed in range(count):
         maps = [searched("F444W", 3 * seed, north=10.0), searched("F356W", 3 * seed + 1)]

@@ -168,7 +168,6 @@ def test_a_gap_does_not_spread_when_a_shift_is_undone(tmp_path):
 )
 def test_the_place_of_shifted_frames_is_known_or_left_to_the_search(tmp_path, cards, place):
     path = aligned_file(tmp_path / "a.fits")
-    expected = dr.Observation.from_fits(path)
     with fits.open(path, mode="update") as hdus:
         for key, value in cards.items():
             if value is None:
@@ -179,12 +178,9 @@ def test_the_place_of_shifted_frames_is_known_or_left_to_the_search(tmp_path, ca
     if not place:
         assert got.first_pixel is None
         return
-    assert got.first_pixel is not None
-    assert expected.first_pixel is not None
-    # The star is on the same place of the detector.
-    np.testing.assert_allclose(
-        got.center + got.first_pixel, expected.center + expected.first_pixel, atol=1e-6
-    )
+    # The star is on the same place of the detector as in the first test.
+    expected = np.add([[149.4, 174.3], [149.6, 174.4]], (491, 1500))
+    np.testing.assert_allclose(got.center + got.first_pixel, expected, atol=1e-6)
 
 
 def measured(star, first=(600, 1630), **changes):

@@ -104,6 +104,7 @@ def test_a_star_without_a_disk_has_none():
     assert disk.fit is fit
 
 
+@cache
 def small_fit():
     """A star without a companion in 24 x 24 pixels."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)

@@ -102,7 +102,10 @@ def slopes_by_name(solver, state):
         yield name, direction, slope_along(solver, state, direction)
 
 
-@pytest.mark.parametrize("frames", [1, 2])
+FRAMES = pytest.mark.parametrize("frames", [pytest.param(1, marks=pytest.mark.slow), 2])
+
+
+@FRAMES
 def test_the_gradient_is_that_of_chi_squared(frames):
     """Against differences of chi-squared, which have an error of 1e-7 of it in these steps."""
     solver, state = solver_of(frames)
@@ -141,7 +144,7 @@ def test_the_gradient_by_companions_is_that_of_chi_squared(contrast):
         np.testing.assert_allclose(float(exact[place]), slope, rtol=1e-3)
 
 
-@pytest.mark.parametrize("frames", [1, 2])
+@FRAMES
 def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames):
     """It outshines the star. Neglected, the gradient would be wrong by more than its size."""
     solver, state = solver_of(frames)
@@ -155,7 +158,7 @@ def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames):
             np.testing.assert_allclose(float(each @ direction), slope, rtol=2e-3, err_msg=name)
 
 
-@pytest.mark.parametrize("frames", [1, 2])
+@FRAMES
 def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames):
     """Against the equations of a copy that is the model; those of a coarse one are far from it."""
     solver, state = solver_of(frames)

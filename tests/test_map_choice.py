@@ -133,7 +133,7 @@ def test_without_any_map_it_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize("rule", ["nearest", "before", "after", "interpolate"])
-@pytest.mark.parametrize("first", [1, 2, 10])
+@pytest.mark.parametrize("first", [1, pytest.param(2, marks=pytest.mark.slow), 10])
 def test_of_one_sensing_the_last_analysis_is_used(tmp_path, caplog, rule, first):
     """Whatever the rule, and the order in which the files were written or are listed."""
     for number in (first, *({1, 2, 10} - {first})):

@@ -157,7 +157,9 @@ MOVES = {
 }
 
 
-@pytest.mark.parametrize("name", [*MOVES, "all"])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(each, marks=pytest.mark.slow) for each in MOVES), "all"]
+)
 @pytest.mark.parametrize("route", ["lattice", "planes"])
 def test_derivatives_follow_changes_in_the_last_pupil(opd, values, name, route):
     """Against derivatives that are computed anew; the errors are those of the field's edges."""

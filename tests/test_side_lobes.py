@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -20,13 +21,20 @@ HIDDEN, PLANET, LOBE = (0.1, -0.08), (-0.3, 0.5), (0.22, 0.3)
 UNIT = ErrorFactor.constant(1.0)
 
 
-def maps_of(light):
-    """Maps of frames with sources, x, y to S/N, about whose star everything is known."""
+@cache
+def star():
+    """The linear model of a star that was fitted, and its templates."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)
     opd = dr.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(), opd, seed=2)
     fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=5))
     ((linear, templates),) = groups_of([fit])
+    return linear, templates
+
+
+def maps_of(light):
+    """Maps of frames with sources, x, y to S/N, about whose star everything is known."""
+    linear, templates = star()
     images = templates.at(torch.tensor(list(light), dtype=torch.float64))
     errors = linear.weigh(images).information.rsqrt()
     contrasts = errors * torch.tensor(list(light.values()))

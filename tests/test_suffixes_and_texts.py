@@ -27,6 +27,8 @@ from pyklip_diffrender.wavefront import choose_map, random_opd
 ROOT = Path(__file__).resolve().parents[1]
 
 SUFFIXES = (".fits", ".fit", ".fts", ".FITS", ".Fit", ".fits.gz", ".FITS.GZ", ".fit.gz", ".fits.fz")
+QUICK = (".fit", ".FITS.GZ", ".fits.fz")
+"""The others need ``--full``."""
 
 MARK = "\N{ZERO WIDTH NO-BREAK SPACE}"
 
@@ -84,7 +86,10 @@ def jobs_in(folder, suffix):
     return job.files == (str(path),)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(
+    "suffix",
+    [pytest.param(s, marks=() if s in QUICK else pytest.mark.slow) for s in SUFFIXES],
+)
 @pytest.mark.parametrize("read", [frames_of, map_of, library_of, jobs_in])
 def test_a_folder_is_read_whatever_the_suffix_of_its_files(tmp_path, suffix, read):
     for name in ("usual", "other"):

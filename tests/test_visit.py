@@ -156,6 +156,7 @@ def test_a_reference_with_another_wavefront_does_not_take_part():
     assert len(fit.frames) == 3
 
 
+@pytest.mark.slow
 def test_a_reference_that_contradicts_the_target_is_left_out_by_name(monkeypatch):
     monkeypatch.setattr("pyklip_diffrender.reduction.visit._UNLIKE", np.inf)
     turned = reference(1)
@@ -196,6 +197,7 @@ def test_limits_are_compared_as_they_are_stated():
     assert "limits would be" in visit.contributions[0].reason
 
 
+@pytest.mark.slow
 def test_frames_that_do_not_fit_into_the_memory_are_left_out(caplog):
     derivatives = 4.0 * alone()[1].linear.frames[0].jacobian.numel()
     # The process and the two rolls, and one frame more.
@@ -264,7 +266,10 @@ def test_exposure_sequences():
     assert exposure_sequences([reference(0), rolled]) == [0, 1]
 
 
-@pytest.mark.parametrize(("rms", "least", "most"), [(0.2e-9, 0.0, 0.9), (5e-9, 1.5, 5.0)])
+@pytest.mark.parametrize(
+    ("rms", "least", "most"),
+    [pytest.param(0.2e-9, 0.0, 0.9, marks=pytest.mark.slow), (5e-9, 1.5, 5.0)],
+)
 def test_the_size_of_the_drift_is_that_of_the_frames(rms, least, most):
     _, fit = alone()
     stated = WavefrontPrior({"segment": 0.6, "texture": 0.3}, knee=1.0)

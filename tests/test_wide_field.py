@@ -90,9 +90,14 @@ def crowded():
     return dr.detect(fit, relinearise=False), frame
 
 
-def test_an_extended_source_is_one_row_with_its_shape(crowded):
+@pytest.fixture(scope="module")
+def crowded_field(crowded):
     detection, frame = crowded
-    table = wide_field(detection, [frame]).candidates
+    return wide_field(detection, [frame])
+
+
+def test_an_extended_source_is_one_row_with_its_shape(crowded_field):
+    table = crowded_field.candidates
     table = table[np.isfinite(table["fit_chi2"])]
     assert sorted(table["shape"]) == ["extended", "point"]
     (point,), (extended,) = (table[table["shape"] == kind] for kind in ("point", "extended"))
@@ -128,9 +133,9 @@ def test_nothing_is_found_outside_the_searched_pixels(crowded):
     assert "point" not in wide.candidates["shape"][np.isfinite(wide.candidates["fit_chi2"])]
 
 
-def test_the_map_has_north_up_and_numbered_circles(crowded):
+def test_the_map_has_north_up_and_numbered_circles(crowded, crowded_field):
     detection, frame = crowded
-    wide = wide_field(detection, [frame])
+    wide = crowded_field
     turned = replace(frame, position_angles=np.array([90.0]))
     fit = detection.fits[0]
     part = replace(fit.frames[0], observation=turned.cutout(24))
