@@ -308,7 +308,7 @@ def _detection() -> list[Breakage]:
         Breakage(
             "inner", "no candidate is inside the smallest separation",
             "if separation_of(more.offsets.numpy())[-1] < self.inner:",
-            "if len(more) > 10:", "detection search",
+            "if len(more) > 10:", "detection",
         ),
         Breakage(
             "inflation", "errors grow with the square root of chi-squared",
