@@ -24,12 +24,9 @@ PACKAGES = (
 )  # fmt: skip
 """Top-level modules and packages in order: each imports only from those before it.
 
-Imports in functions and under TYPE_CHECKING count. One of them goes the other way: see `LATE`.
+Imports in functions and under TYPE_CHECKING count.
 Inside a package, and inside packages of that package, imports must form no circle.
 """
-
-LATE = ("reduction.reduction_result", "reduction.products")
-"""`Reduction.write` imports the products, which know the class, when it is called."""
 
 OWNERS = {
     "astroquery": ("archive",),
@@ -76,19 +73,6 @@ def imported_names(tree, inside):
                 yield node.lineno, str(first.value)
 
 
-def method_lines(tree):
-    """Lines inside the methods of classes."""
-    return {
-        node.lineno
-        for owner in ast.walk(tree)
-        if isinstance(owner, ast.ClassDef)
-        for method in owner.body
-        if isinstance(method, ast.FunctionDef)
-        for node in ast.walk(method)
-        if isinstance(node, ast.stmt)
-    }
-
-
 def violations(sources):
     """What is wrong with the imports of modules, given as path below the package and text."""
     found = []
@@ -103,14 +87,12 @@ def violations(sources):
             continue
         inside = ".".join([PACKAGE, *path.parts[:-1]])
         tree = ast.parse(sources[path])
-        late = method_lines(tree)
         for line, imported in imported_names(tree, inside):
             top, _, rest = imported.partition(".")
             owners = OWNERS.get(top)
             if owners and not any(f"{name}.".startswith(f"{owner}.") for owner in owners):
                 found.append(f"{path}:{line}: only {' and '.join(owners)} may import {top}")
-            is_late = name == LATE[0] and f"{rest}.".startswith(f"{LATE[1]}.") and line in late
-            if top != PACKAGE or is_late:
+            if top != PACKAGE:
                 continue
             other = rest.split(".")[0]
             if other not in PACKAGES:

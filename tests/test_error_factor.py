@@ -9,7 +9,11 @@ import pytest
 from scipy import stats
 from scipy.ndimage import gaussian_filter
 
-from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance
+from pyklip_diffrender.detection.error_factor import (
+    ErrorFactor,
+    Significance,
+    structures_in_single_roll,
+)
 
 PIXEL = 0.06
 RESOLUTION = 0.15
@@ -182,3 +186,10 @@ def test_noise_exceeds_the_threshold_as_rarely_as_gaussian_noise():
     assert exceeded == pytest.approx(stats.norm.sf(3.0), rel=0.15)
     known = ErrorFactor.constant(1.5)
     np.testing.assert_allclose(known.threshold(3.0, offsets), 3.0)
+
+
+def test_structures_of_the_detector_are_as_frequent_as_in_real_single_rolls():
+    # Of 12 real rolls, two have a candidate above 5.5; of their 20 signs, six a peak above 4.
+    assert 12 * structures_in_single_roll(5.5) == pytest.approx(1.2, abs=0.5)
+    assert 20 * structures_in_single_roll(4.0) == pytest.approx(6, abs=1.5)
+    assert 0 < structures_in_single_roll(30.0) < 1e-7

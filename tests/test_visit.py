@@ -14,8 +14,11 @@ from astropy.time import Time
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import sources_of_references
+from pyklip_diffrender.detection.error_factor import structures_in_single_roll
+from pyklip_diffrender.errors import CorruptFileError, ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.pattern import choose_systematics, pattern_for_visit
-from pyklip_diffrender.reduction import Visit
+from pyklip_diffrender.reduction import ReduceOptions, Visit, pipeline
+from pyklip_diffrender.reduction import visit as visits
 from pyklip_diffrender.reduction.visit import rough_settings, with_references
 from pyklip_diffrender.refinement import GaussNewton, align_frame, join_frames, refine
 from pyklip_diffrender.refinement.solver import exposure_sequences
@@ -52,7 +55,7 @@ def frame(star, k, light, **facts):
     error = np.sqrt(0.25 + 0.01 * np.abs(light))
     data = flat * light + error * np.random.default_rng(k).normal(size=light.shape)
     header = fits.Header(
-        {"INSTRUME": "NIRCAM", "DETECTOR": "NRCA2", "CORONMSK": "MASKA335R", "TARGPROP": star}
+        {"INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R", "TARGPROP": star}
     )
     facts = {
         "date": Time(f"2022-10-03T0{k}:00"),
@@ -277,3 +280,119 @@ def test_the_size_of_the_drift_is_that_of_the_frames(rms, least, most):
     joint = together(fit, [reference(k, drift=rms) for k in range(3)], settings)
     assert least < joint.scales["texture dither"] / 0.3 < most
     assert joint.scales["texture dither"] <= 4.0001 * 0.3
+
+
+def test_frames_that_never_agree_are_left_out(monkeypatch):
+    monkeypatch.setattr(visits, "_ROUNDS", 2)
+    monkeypatch.setattr(
+        visits,
+        "_contradicting",
+        lambda joint, count: {joint.frames[count].observation.name: "it contradicts the others"},
+    )
+    fit, visit = joined(*(reference(k) for k in range(3)))
+    assert fit is alone()[1]
+    first, second, third = (each.reason for each in visit.contributions)
+    assert first == second == "it contradicts the others"
+    assert third.endswith("has no end")
+
+
+def test_a_single_roll_may_show_a_structure_of_the_detector():
+    # Nothing is stated of fits that do not explain their frames, as here those without a drift.
+    both, single = (
+        dr.detect(replace(fit, status=dr.Status.CONVERGED), threshold=4.0)
+        for fit in (alone()[1], refine(model(), science()[:1], OPD, settings=SETTINGS))
+    )
+    assert (both.rolls, single.rolls) == (2, 1)
+    for detection in (both, single):
+        assert len(detection.candidates) == 1
+    (row,) = single.candidates
+    structures = float(structures_in_single_roll(row["snr"]))
+    assert structures <= row["false_alarm_probability"] < 2 * structures
+    (row,) = both.candidates
+    assert row["false_alarm_probability"] < 0.1 * structures
+    assert "2 candidates in 12 real rolls" in single.remark
+    assert both.remark == ""
+
+
+@cache
+def fitted_reference():
+    """The fit of three dithers of the reference star, from the map."""
+    frames = [replace(reference(k), reference=False) for k in range(3)]
+    choice = choose_systematics(frames, (), model(), OPD, settings=SETTINGS)
+    fit = refine(model(), frames, OPD, systematics=choice.systematics, settings=SETTINGS)
+    return dr.ReferenceStar.of(fit)
+
+
+def sequence(*references):
+    return dr.Sequence("HD 1", science(), references)
+
+
+def test_the_file_of_a_reference_star_is_a_map_and_a_library_of_patterns(tmp_path):
+    star = fitted_reference()
+    path = star.write(tmp_path / "reference.fits")
+    again = dr.ReferenceStar.read(path)
+    np.testing.assert_array_equal(again.wavefront.data, star.wavefront.data)
+    np.testing.assert_array_equal(dr.read_opd(path).data, star.wavefront.data)
+    assert again.wavefront.date == star.wavefront.date == reference(0).date
+    assert len(dr.PatternLibrary.read(path).patterns) == 3
+    for name in ("star", "filter", "image_mask", "detector", "frames", "status", "start"):
+        assert getattr(again, name) == getattr(star, name)
+    assert again.star == "HD 2"
+    with pytest.raises(ExistingFileError):
+        star.write(path)
+    with pytest.raises(CorruptFileError, match="no reference star in it"):
+        dr.ReferenceStar.read(tmp_path / fits_of_a_map(tmp_path))
+
+
+def fits_of_a_map(folder):
+    fits.PrimaryHDU(OPD.data, fits.Header({"BUNIT": "m"})).writeto(folder / "opd.fits")
+    return "opd.fits"
+
+
+def test_a_reference_star_in_place_of_a_map_makes_limits_deeper():
+    star = fitted_reference()
+    begun = pipeline.prepare(sequence(reference(0), reference(4)), star, ReduceOptions(size=SIZE))
+    assert begun.wavefront is star.wavefront
+    # A frame that the star was fitted to is not used again.
+    assert [each.name for each in begun.sequence.references] == ["HD 2 8"]
+    pattern = begun.options.systematics
+    assert isinstance(pattern, dr.Systematics)
+    assert pattern.provenance["frames"] == list(star.frames)
+    settings = replace(SETTINGS, prior=replace(SETTINGS.prior, scales=begun.settings.prior.scales))
+    fit = refine(model(), science(), star.wavefront, systematics=pattern, settings=settings)
+    assert limit(fit) < limit(alone()[1]) / 1.05
+    detection = dr.detect(fit)
+    assert len(detection.candidates) == 1
+    (found,) = detection.candidates
+    assert abs(found["contrast"] - PLANET.contrast) < 3 * found["contrast_error"]
+
+
+def test_the_prior_about_a_reference_star_grows_with_the_days():
+    star = fitted_reference()
+    usual = GaussNewton.nircam("F444W").prior.scales["segment"]
+    scales = []
+    for days in (0.1, 1.0, 5.0, 30.0):
+        later = replace(science()[0], date=star.wavefront.date + days * u.day)
+        scales.append(star.settings_for(later).prior.scales["segment"])
+    assert scales == sorted(scales)
+    # 2.7 nm within hours, and 9 nm after 3.6 days.
+    assert scales[2] / scales[0] == pytest.approx((2.7 + 5 * 1.75) / (2.7 + 0.1 * 1.75))
+    assert scales[-1] == usual
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"filter": "F356W"}, "got the filter F356W, expected F444W"),
+        ({"header": {"CORONMSK": "MASKA430R"}}, "got the mask MASK430R, expected MASK335R"),
+        ({"header": {"DETECTOR": "NRCA2"}}, "got the detector NRCA2, expected NRCALONG"),
+        ({"name": "HD 2 4"}, "one of the frames that the reference star HD 2 was fitted to"),
+    ],
+)
+def test_a_reference_star_of_other_frames_is_refused(changes, message):
+    frames = science()
+    changes = {**changes, "header": {**frames[0].header, **changes.get("header", {})}}
+    changes["header"] = fits.Header(changes["header"])
+    other = replace(sequence(), science=(replace(frames[0], **changes), frames[1]))
+    with pytest.raises(IncompatibleSetupError, match=message):
+        pipeline.prepare(other, fitted_reference(), ReduceOptions(size=SIZE))

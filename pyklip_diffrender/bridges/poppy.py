@@ -246,12 +246,28 @@ class PoppySystem(OpticalSystem):
     ) -> Any:
         """PSF as an HDUList, with the arguments and the keywords of poppy's `calc_psf`.
 
-        Wavelengths are by default those that the system was made for, and weights are equal;
-        `source` may have both. `opd` and options are as in a call of the system; options of poppy's
-        that have no meaning here are dropped, nothing is drawn, and saving is refused with a
-        pointer to `return_intermediates`. With that or `return_final`, the second value is a list
-        of `poppy.Wavefront`, one for every pupil plane and the detector, or the one on the
-        detector, summed over wavelengths as poppy does.
+        Parameters
+        ----------
+        wavelength : Quantity, float (m) or sequence of them, optional
+            Default: the wavelengths that the system was made for.
+        weight : sequence of float, optional
+            One per wavelength; default equal.
+        source : dict, optional
+            With "wavelengths" and "weights", in place of the two above.
+        normalize : str
+            "first", "last", "exit_pupil" or "none", as in poppy.
+        return_intermediates, return_final : bool
+            Also return a list of `poppy.Wavefront`: one for every pupil plane and the detector,
+            or the one on the detector. They are summed over wavelengths as poppy does.
+        opd, **options
+            As in a call of the system. Options of poppy's that have no meaning here are dropped.
+        save_intermediates, save_intermediates_what, display
+            Accepted for compatibility with poppy. Nothing is drawn, and saving is refused with a
+            pointer to `return_intermediates`.
+
+        Returns
+        -------
+        HDUList, or (HDUList, list of Wavefront)
         """
         refuse_saving(save_intermediates)
         if source is not None:

@@ -321,11 +321,20 @@ class WebbSystem(PoppySystem):
     ) -> Any:
         """PSF as an HDUList, with the arguments, extensions and keywords of stpsf's `calc_psf`.
 
-        Arguments that are not given keep the values that the system was made with; `opd` and
-        parameters are as in a call of the system, for the PSF of a refined wavefront. The image is
+        Arguments that are not given keep the values that the system was made with. The image is
         this system's; stpsf itself then adds jitter, distortion, detector effects and header.
-        Extensions are OVERSAMP, DET_SAMP, and with `add_distortion` OVERDIST and DET_DIST. Nothing
-        is drawn, and saving intermediates is refused.
+
+        Parameters
+        ----------
+        opd, **parameters
+            As in a call of the system, for the PSF of a refined wavefront.
+        display, save_intermediates
+            Accepted for compatibility with stpsf; nothing is drawn, and saving is refused.
+
+        Returns
+        -------
+        HDUList, or (HDUList, list of poppy.Wavefront)
+            OVERSAMP, DET_SAMP, OVERDIST and DET_DIST, the last two with `add_distortion`.
         """
         refuse_saving(save_intermediates)
         arguments = {

@@ -18,12 +18,18 @@ from torch import Tensor
 from pyklip_diffrender.detection.candidates import (
     Candidates,
     Maps,
+    count_rolls,
     lacks_candidates,
     refine_candidates,
     with_companions,
     with_position_of_star,
 )
-from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance, contrast_table
+from pyklip_diffrender.detection.error_factor import (
+    ErrorFactor,
+    Significance,
+    contrast_table,
+    structures_in_single_roll,
+)
 from pyklip_diffrender.detection.field import (
     Image,
     Sky,
@@ -429,7 +435,11 @@ def detect(
     # The noise of fits that do not explain their data is not known.
     false_alarm = np.full(len(candidates), np.nan)
     if all(fit.status.calibrated for fit in fits):
-        false_alarm = significance.false_alarms(factor, candidates.snr(factor), candidates.offsets)
+        snr = candidates.snr(factor)
+        false_alarm = significance.false_alarms(factor, snr, candidates.offsets)
+        if count_rolls(fits) == 1 and any(f.frames[0].observation.is_nircam for f in fits):
+            # Either noise or a structure of the detector, which only a second roll can tell.
+            false_alarm = 1 - (1 - false_alarm) * (1 - structures_in_single_roll(snr))
     return Detection(
         fits=tuple(fits),
         groups=maps.groups,
@@ -564,7 +574,12 @@ def contrast_curve(
     Returns
     -------
     QTable
-        See `contrast.contrast_table`.
+        One row for each separation (arcsec), with contrasts of a 5-sigma point source: the median
+        of the ring (``contrast``, also as ``delta_mag``), its ``lowest`` and ``highest`` value, the
+        median with the small-sample correction of measured errors (``small_sample``), and that of
+        a star whose image were known (``known_star``). All but the latter include
+        ``error_factor``, by which errors were multiplied; ``flux_density`` (Jy) is that of the
+        median, in the photometric calibration of the frames.
 
     Raises
     ------

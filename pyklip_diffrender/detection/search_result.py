@@ -142,7 +142,7 @@ class Detection:
         Smallest S/N of a candidate in Gaussian noise. Where errors were scaled to the scatter of
         the S/N, ``error_factor.threshold(threshold, offsets)`` is that at a position.
     contrast_curve : QTable
-        See `contrast.contrast_table`.
+        See `contrast_curve`.
     has_limits : ndarray of bool, (ny, nx)
         Pixels whose limits are in the curve.
     grid : ndarray, (ny, nx, 2)

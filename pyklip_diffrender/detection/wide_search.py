@@ -396,7 +396,7 @@ class WideField:
         extended source, or several that are blended, are one row with the contrast of all of its
         light.
     contrast_curve : QTable
-        See `contrast.contrast_table`.
+        See `contrast_curve`.
     light : tuple of ndarray, (ny, nx)
         Light of the sources outside the fitted pixels in every frame, in the data's unit.
 

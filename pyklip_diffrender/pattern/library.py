@@ -157,6 +157,11 @@ class PatternLibrary:
             If the file exists, and `overwrite` is False; it is also an `OSError`.
         """
         require_new([path], overwrite)
+        write_fits(self.to_hdus(), path)
+        return Path(path)
+
+    def to_hdus(self) -> fits.HDUList:
+        """Return what `write` writes, as an HDUList."""
         primary = fits.PrimaryHDU()
         primary.header["PATVERS"] = (_VERSION, "version of the layout")
         hdus = [primary]
@@ -165,8 +170,7 @@ class PatternLibrary:
         if len(self.validation):
             hdus.append(fits.table_to_hdu(self.validation))
             hdus[-1].name = "VALIDATION"
-        write_fits(fits.HDUList(hdus), path)
-        return Path(path)
+        return fits.HDUList(hdus)
 
 
 def combine_libraries(libraries: Iterable[PatternLibrary]) -> PatternLibrary:

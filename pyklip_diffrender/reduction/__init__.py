@@ -5,11 +5,12 @@ from pyklip_diffrender.reduction.products import (
     PRODUCTS,
     UNFINISHED,
     ProductFolder,
+    Reduction,
     existing_products,
     write_products,
     write_report,
 )
-from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.reference_star import ReferenceStar
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
     combined_rows,
@@ -29,6 +30,7 @@ __all__ = [
     "ProductFolder",
     "ReduceOptions",
     "Reduction",
+    "ReferenceStar",
     "Visit",
     "combined_rows",
     "compare_reductions",

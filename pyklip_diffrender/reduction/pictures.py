@@ -31,7 +31,7 @@ from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.reduction.pages import Picture, number, plus_minus, scientific
-from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.reduction_result import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
@@ -46,7 +46,7 @@ Image = NDArray[np.float64]
 class SkyImages:
     """Images with north up, or with the orientation of the first frame where north is not known."""
 
-    def __init__(self, reduction: Reduction) -> None:
+    def __init__(self, reduction: ReductionResult) -> None:
         self.detection: Detection = reduction.detection
         self._disk = reduction.disk
         self._templates = self.detection.groups[0][1]
@@ -154,7 +154,7 @@ class Klip:
     label: str  # references and modes of the image
 
     @classmethod
-    def of(cls, reduction: Reduction) -> Klip | None:
+    def of(cls, reduction: ReductionResult) -> Klip | None:
         """KLIP for a reduction; None where it has no references or fails."""
         sequence, detection = reduction.sequence, reduction.detection
         if not sequence.references and len(sequence.science) < 2:
@@ -278,7 +278,7 @@ class ReportPictures:
 
     @classmethod
     def of(
-        cls, reduction: Reduction, overview: Overview, summary: Mapping[str, Any]
+        cls, reduction: ReductionResult, overview: Overview, summary: Mapping[str, Any]
     ) -> ReportPictures:
         """Draw all that a reduction has."""
         detection = reduction.detection
@@ -367,7 +367,9 @@ def _kept(
     return f"{subject} {', '.join([*first, *others])}{source}. " if parts else ""
 
 
-def _curve(reduction: Reduction, summary: Mapping[str, Any], klip: QTable | None) -> list[Picture]:
+def _curve(
+    reduction: ReductionResult, summary: Mapping[str, Any], klip: QTable | None
+) -> list[Picture]:
     """The contrast curve, with that of KLIP if it is known."""
     detection = reduction.detection
     limits = "; ".join(
@@ -604,7 +606,7 @@ def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
     )
 
 
-def _star(reduction: Reduction, frame: int) -> list[Picture]:
+def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
     """Data, model and residual of a frame."""
     detection = reduction.detection
     observation = detection.fits[0].frames[frame].observation
@@ -637,7 +639,7 @@ def _star(reduction: Reduction, frame: int) -> list[Picture]:
     )
 
 
-def _wavefront(reduction: Reduction, summary: Mapping[str, Any]) -> list[Picture]:
+def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[Picture]:
     """The wavefront before and after the fit."""
     fit, about = reduction.fit, summary["wavefront_map"]
     before, after = wavefronts(fit)

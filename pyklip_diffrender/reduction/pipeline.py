@@ -40,9 +40,10 @@ from pyklip_diffrender.pattern import (
     as_request,
     choose_systematics,
     fit_with_pattern,
+    with_known_pattern,
 )
-from pyklip_diffrender.reduction.products import Checkpoint, ProductFolder
-from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.products import Checkpoint, ProductFolder, Reduction
+from pyklip_diffrender.reduction.reference_star import reference_star_in
 from pyklip_diffrender.reduction.visit import Joined, rough_settings, with_references
 from pyklip_diffrender.refinement import (
     GaussNewton,
@@ -417,6 +418,13 @@ def prepare(
     must be inside the frames. With a model, as many pixels as its detector has are fitted; those
     beyond the edges of the frames are masked. Raises as `reduce`.
     """
+    reference = reference_star_in(opd)
+    if reference is not None:
+        for each in sequence.science:
+            reference.require_setup_of(each)
+        # What its frames say is in the prior already.
+        others = tuple(each for each in sequence.references if each.name not in reference.frames)
+        sequence, opd = replace(sequence, references=others), reference.wavefront
     wavefront = wavefront_for(opd, sequence.date)
     if options.star_flux is not None:
         for each in sequence.science:
@@ -437,6 +445,12 @@ def prepare(
         cut = sequence.cutout(options.size)
     else:
         cut = sequence.cutout(model.detector.shape, beyond_edges=True)
+    if reference is not None and settings is None:
+        settings = reference.settings_for(cut.science[0])
+        pattern = reference.pattern_for(cut.science[0])
+        if pattern is not None and options.systematics == "auto":
+            options = replace(options, systematics=pattern)
+            settings = with_known_pattern(settings)
     return Preparation(sequence, cut, model, wavefront, options, settings)
 
 

@@ -33,7 +33,8 @@ from pyklip_diffrender.reduction.pages import (
     write_figures,
 )
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
-from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.reduction_result import ReductionResult
+from pyklip_diffrender.reduction.reference_star import ReferenceStar
 from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import GaussNewton, Refinement
@@ -47,6 +48,7 @@ __all__ = [
     "UNFINISHED",
     "Checkpoint",
     "ProductFolder",
+    "Reduction",
     "existing_products",
     "page",
     "write_products",
@@ -243,6 +245,7 @@ PRODUCTS = {
     "completeness.ecsv": "fraction of planets that the search finds, by contrast and separation",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the flat-field pattern, for other reductions",
+    "reference.fits": "wavefront and pattern, for fits of other stars of the visit",
     UNFINISHED: "stages that are done, for a reduction that is resumed",
 }
 """Every file that a reduction may write, with its content."""
@@ -271,7 +274,7 @@ def existing_products(folder: Path) -> list[Path]:
 
 
 def write_products(
-    reduction: Reduction,
+    reduction: ReductionResult,
     folder: Path,
     *,
     fit: bool = True,
@@ -299,6 +302,9 @@ def write_products(
         written.append(reduction.disk.write(folder, overwrite=True))
     if reduction.systematics is not None:
         written.append(reduction.systematics.write(folder / "systematics.fits", overwrite=True))
+    if reduction.fit.status.usable:
+        reference = ReferenceStar.of(reduction.fit)
+        written.append(reference.write(folder / "reference.fits", overwrite=True))
     tables = {"injections": reduction.injections, "completeness": reduction.completeness}
     for name, table in tables.items():
         if table is not None:
@@ -315,6 +321,91 @@ def write_products(
     for path in set(existing_products(folder)) - set(written):
         path.unlink()
     return written
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Reduction(ReductionResult):
+    """Result of `reduce`.
+
+    Attributes
+    ----------
+    sequence : Sequence
+        The frames, cut to the fitted pixels.
+    fit : Refinement
+        The fit that was searched: all frames of the target together, with the bright candidates in
+        the model, and without the light of a disk, if that was fitted.
+    detection : Detection
+    references : tuple of Refinement
+        One for each reference star that was fitted.
+    systematics : Systematics or None
+        The flat-field pattern that was used.
+    failed : tuple of (str, str)
+        Reference stars that could not be fitted, and why.
+    pattern : str
+        Origin of the flat-field pattern, with the names of its stars.
+    visit : Visit
+        What every frame of a reference star has contributed to the fit of the target.
+    wide : WideField or None
+        The search of the whole frames, if it was asked for.
+    disk : Disk or None
+        Extended light about the star, if it was asked for.
+    injections : QTable or None
+        Measurements of injected planets, see `recover_planets`, if they were asked for.
+    completeness : QTable or None
+        Fraction of planets that the search finds, see `completeness`, if it was asked for.
+    accuracy : str
+        "full", or "quick" for a first look, see `ReduceOptions`.
+
+    Examples
+    --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
+    >>> print(result.detection.candidates["separation", "contrast", "snr"])  # doctest: +SKIP
+    >>> result.write("products")  # doctest: +SKIP
+    """
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+        derivatives: bool = False,
+        figures: Literal["pdf", "png", "svg"] | None = None,
+    ) -> list[Path]:
+        """Write maps, tables, the fit, the flat-field pattern, figures and a report.
+
+        Parameters
+        ----------
+        folder : path
+            Made if it does not exist.
+        overwrite : bool
+            Replace the products of an earlier reduction, and remove those that this one does not
+            have.
+        derivatives : bool
+            Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
+            space: they are needed to search the fit again (`detect`), and to measure at other
+            places (``Detection.read(...).measure``).
+        figures : {"pdf", "png", "svg"}, optional
+            Write every figure of the report to a file of this format in the folder ``figures``,
+            too. The report itself needs none of them.
+
+        Returns
+        -------
+        list of Path
+            The files that were written.
+
+        Raises
+        ------
+        ExistingFileError
+            If there are products in the folder, and `overwrite` is False; it is also an `OSError`.
+        IncompatibleSetupError
+            For another format of figures.
+        """
+        folder = Path(folder)
+        require_new(existing_products(folder), overwrite)
+        return write_products(self, folder, derivatives=derivatives, figures=figures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -467,7 +558,9 @@ def _fingerprint(sequence: Sequence, opd: OPDMap, options: Any) -> str:
     return total.hexdigest()
 
 
-def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ()) -> list[Path]:
+def write_report(
+    reduction: ReductionResult, folder: Path, files: Iterable[Path] = ()
+) -> list[Path]:
     """Write ``report.html``, one page that needs no other file, and ``summary.json``.
 
     Files of these names are replaced. The page lists `files`, other products.
@@ -476,7 +569,7 @@ def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ())
     return _write_page(*_shown(reduction, overview), folder, files)
 
 
-def _shown(reduction: Reduction, overview: Overview) -> tuple[dict[str, Any], ReportPictures]:
+def _shown(reduction: ReductionResult, overview: Overview) -> tuple[dict[str, Any], ReportPictures]:
     """Numbers and pictures of the report."""
     summary = summarise(reduction, overview.klip and overview.klip.curve)
     return summary, ReportPictures.of(reduction, overview, summary)

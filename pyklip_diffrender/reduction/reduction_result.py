@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from astropy.table import QTable
@@ -14,14 +11,13 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pyklip_diffrender.detection import Detection, Disk, WideField
-from pyklip_diffrender.io.files import require_new
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.reduction.visit import Visit
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.systematics import Systematics
 
-__all__ = ["Reduction", "looks_extended", "on_extended_light"]
+__all__ = ["ReductionResult", "looks_extended", "on_extended_light"]
 
 
 # Whether candidates are parts of extended light, such as a disk, rather than planets.
@@ -94,47 +90,8 @@ _HOPELESS = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Reduction:
-    """Result of `reduce`.
-
-    Attributes
-    ----------
-    sequence : Sequence
-        The frames, cut to the fitted pixels.
-    fit : Refinement
-        The fit that was searched: all frames of the target together, with the bright candidates in
-        the model, and without the light of a disk, if that was fitted.
-    detection : Detection
-    references : tuple of Refinement
-        One for each reference star that was fitted.
-    systematics : Systematics or None
-        The flat-field pattern that was used.
-    failed : tuple of (str, str)
-        Reference stars that could not be fitted, and why.
-    pattern : str
-        Origin of the flat-field pattern, with the names of its stars.
-    visit : Visit
-        What every frame of a reference star has contributed to the fit of the target.
-    wide : WideField or None
-        The search of the whole frames, if it was asked for.
-    disk : Disk or None
-        Extended light about the star, if it was asked for.
-    injections : QTable or None
-        Measurements of injected planets, see `recover_planets`, if they were asked for.
-    completeness : QTable or None
-        Fraction of planets that the search finds, see `completeness`, if it was asked for.
-    accuracy : str
-        "full", or "quick" for a first look, see `ReduceOptions`.
-
-    Examples
-    --------
-    With frames and wavefront maps in folders, which the package does not contain:
-
-    >>> import pyklip_diffrender as dr
-    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
-    >>> print(result.detection.candidates["separation", "contrast", "snr"])  # doctest: +SKIP
-    >>> result.write("products")  # doctest: +SKIP
-    """
+class ReductionResult:
+    """What a reduction has found, without the means to write it: see `Reduction`."""
 
     sequence: Sequence
     fit: Refinement
@@ -225,47 +182,3 @@ class Reduction:
             facts["Remark"] = self.remark
         head = html_summary(f"Reduction of {self.sequence.target}", facts)
         return f"{head}\n{self.detection._repr_html_()}"
-
-    def write(
-        self,
-        folder: str | os.PathLike[str],
-        *,
-        overwrite: bool = False,
-        derivatives: bool = False,
-        figures: Literal["pdf", "png", "svg"] | None = None,
-    ) -> list[Path]:
-        """Write maps, tables, the fit, the flat-field pattern, figures and a report.
-
-        Parameters
-        ----------
-        folder : path
-            Made if it does not exist.
-        overwrite : bool
-            Replace the products of an earlier reduction, and remove those that this one does not
-            have.
-        derivatives : bool
-            Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
-            space: they are needed to search the fit again (`detect`), and to measure at other
-            places (``Detection.read(...).measure``).
-        figures : {"pdf", "png", "svg"}, optional
-            Write every figure of the report to a file of this format in the folder ``figures``,
-            too. The report itself needs none of them.
-
-        Returns
-        -------
-        list of Path
-            The files that were written.
-
-        Raises
-        ------
-        ExistingFileError
-            If there are products in the folder, and `overwrite` is False; it is also an `OSError`.
-        IncompatibleSetupError
-            For another format of figures.
-        """
-        # The one import against the order of the modules: the products know this class.
-        from pyklip_diffrender.reduction.products import existing_products, write_products
-
-        folder = Path(folder)
-        require_new(existing_products(folder), overwrite)
-        return write_products(self, folder, derivatives=derivatives, figures=figures)

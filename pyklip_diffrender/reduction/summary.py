@@ -19,7 +19,7 @@ from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction.pages import advice, sentence
-from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.reduction_result import ReductionResult
 from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.observation import Observation
 
@@ -31,7 +31,7 @@ _LIMITS = (0.5, 1.0, 1.5, 2.0)
 _LIBRARIES = ("torch", "numpy", "scipy", "astropy", "photutils", "matplotlib")
 
 
-def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any]:
+def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[str, Any]:
     """Return what a reduction shows as nested dicts and lists of plain values.
 
     `klip` is KLIP's contrast curve of the same frames. Keys end in the unit of their values; None
@@ -142,7 +142,7 @@ def _wavefront_map(fit: Refinement, frame: Observation) -> dict[str, Any]:
     }
 
 
-def _systematics(reduction: Reduction) -> dict[str, Any] | None:
+def _systematics(reduction: ReductionResult) -> dict[str, Any] | None:
     used = reduction.systematics
     if used is None:
         return None
@@ -187,7 +187,7 @@ def _rows(table: QTable) -> list[dict[str, Any]]:
     ]
 
 
-def _candidates(reduction: Reduction) -> list[dict[str, Any]]:
+def _candidates(reduction: ReductionResult) -> list[dict[str, Any]]:
     """Candidates; those that look like extended light have no false-alarm probability."""
     rows = _rows(reduction.detection.candidates)
     if reduction.extended:
@@ -231,7 +231,7 @@ def _injected(planets: QTable) -> dict[str, Any]:
     }
 
 
-def _completeness(reduction: Reduction) -> dict[str, Any] | None:
+def _completeness(reduction: ReductionResult) -> dict[str, Any] | None:
     """Contrasts at which 50 and 95 % of planets are found, None where there are none."""
     fractions, curve = reduction.completeness, reduction.detection.contrast_curve
     if fractions is None:

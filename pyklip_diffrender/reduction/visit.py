@@ -39,12 +39,13 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["Contribution", "Visit", "rough_settings", "with_references"]
+__all__ = ["Contribution", "Visit", "rough_settings", "slew_drift", "with_references"]
 
 _log = logging.getLogger(__name__)
 
 _SLEWS = WavefrontPrior(scales={"segment": 0.75, "texture": 0.5}, knee=1.0, slope=1.0)
 _DITHERS = WavefrontPrior(scales={"segment": 0.4, "texture": 0.25}, knee=1.0, slope=1.0)
+_SLEW_RMS = 2.7
 _CYCLES = 8.0
 """Drift of the wavefront, nm, between exposures with a slew between them and between the dithers of
 one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show it within a factor
@@ -153,6 +154,12 @@ class Joined(NamedTuple):
     detection: Detection | None = None  # its search, if there was one
 
 
+def slew_drift(further: float = 0.0) -> WavefrontPrior:
+    """Prior of the drift from one star to the next, `further` nm rms beyond that within hours."""
+    growth = 1 + further / _SLEW_RMS
+    return replace(_SLEWS, scales={name: growth * scale for name, scale in _SLEWS.scales.items()})
+
+
 def rough_settings(settings: GaussNewton) -> GaussNewton:
     """Settings of a fit of the target from which the fit of all frames goes on."""
     return replace(settings, tolerance=max(settings.tolerance, _ROUGH), widen_prior=False)
@@ -221,6 +228,10 @@ def with_references(
                 break
             left_out |= contradicting
             used = [each for each in used if each.name not in contradicting]
+        else:
+            joint = None
+            reason = "what contradicts the target in the frames of reference stars has no end"
+            left_out |= {each.name: reason for each in used}
     if joint is None or not joint.status.usable:
         return Joined(fit, Visit(_left_out(references, left_out)))
     searches = None if search is None else (search(fit), search(joint))

@@ -62,16 +62,6 @@ COLUMNS: dict[str, type] = {
 
 Contrasts come first, because a table that is too wide to print loses its middle."""
 
-_UNITS = {
-    "separation_arcsec": u.arcsec,
-    "position_angle_deg": u.deg,
-    "injected_separation_arcsec": u.arcsec,
-    "injected_angle_deg": u.deg,
-    "seconds": u.s,
-    "peak_memory_bytes": u.byte,
-}
-"""Contrasts, S/N and counts have none."""
-
 _FORMATS = {"contrast": ".2e", "snr": ".1f"}
 
 _UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s, "bytes": u.byte}
@@ -134,7 +124,6 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
         values = [each[name] for each in rows]
         known = [kind() if value is None else kind(value) for value in values]
         table[name] = MaskedColumn(known, mask=[value is None for value in values], dtype=kind)
-        table[name].unit = _UNITS.get(name)
         table[name].info.format = _FORMATS.get(name)
         table[name].unit = _unit(name)
         table[name].description = _DESCRIPTIONS.get(name, "")

@@ -145,7 +145,7 @@ def read_opd(
     except (ValueError, u.UnitConversionError) as error:
         raise UnitError(f"{path.name}: BUNIT is {unit!r}, expected a unit of length") from error
     date = sensing_date(header, path.name)
-    return _checked(OPDMap(data, date, path.name, sha256(path)))
+    return _checked(OPDMap(data, date, path.name, sha256(path), path=path))
 
 
 def as_opd_map(opd: Any) -> OPDMap:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,8 @@ class OPDMap:
         Field point at which the wavefront was sensed, empty if unknown.
     history : tuple of str
         Processing steps on reading.
+    path : Path or None
+        File that it was read from.
     """
 
     data: NDArray[np.float64] = field(repr=False)
@@ -50,6 +53,7 @@ class OPDMap:
     sha256: str = field(repr=False)
     aperture: str = ""
     history: tuple[str, ...] = field(default=(), repr=False)
+    path: Path | None = field(default=None, repr=False)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.float64]:
         return np.array(self.data, dtype=dtype)
