@@ -177,6 +177,24 @@ def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path):
     assert [each.name for each in planned(config)] == ["HD 1", "HD 1"]
 
 
+def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path):
+    config = inputs(tmp_path, 1)
+    maps, frames = tmp_path / "maps", tmp_path / "frames"
+    maps.mkdir()
+    for day in ("01", "11", "29"):
+        header = fits.Header({"BUNIT": "m", "DATE-OBS": f"2022-08-{day}T00:00:00"})
+        opd = dr.random_opd(1, npix=16).data
+        fits.PrimaryHDU(opd, header).writeto(maps / f"map{day}.fits")
+    config["sequence"][0] |= {"opd": str(maps), "files": str(frames)}
+    calints(frames / "target.fits", date="2022-08-15T00:00:00")
+    # The reference star was observed when another map was the nearest.
+    cards = {"IS_PSF": True}
+    calints(frames / "star.fits", "HD 2", observation=2, date="2022-08-01T00:00:00", cards=cards)
+    (job,) = planned(config)
+    assert job.opd == str(maps / "map11.fits")
+    assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
+
+
 def test_a_sequence_may_have_no_map(tmp_path, monkeypatch):
     (tmp_path / "flat").mkdir()
     monkeypatch.chdir(tmp_path)
