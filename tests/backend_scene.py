@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
-import pytest
 from astropy.io import fits
-from numpy.typing import NDArray
 
-from pyklip_diffrender.pyklip_backend import DiffrenderSettings, Fit, Subtraction
-from pyklip_diffrender.wavefront import OPDMap, as_opd_map
+from pyklip_diffrender.pyklip_backend import Fit, Subtraction
+from pyklip_diffrender.wavefront import as_opd_map
 
 SHAPE = (48, 44)
 CENTER = (21.25, 24.5)
@@ -21,14 +15,14 @@ OPD = as_opd_map(RIPPLE)
 BACKGROUND = 3.0
 
 
-def in_place_of_fits(monkeypatch: pytest.MonkeyPatch, subtract: Callable[..., Any]) -> None:
+def in_place_of_fits(monkeypatch, subtract):
     """Give the backend another subtractor, which gets the references as the default one does."""
     monkeypatch.setattr(
         "pyklip_diffrender.pyklip_backend.klip_call.subtract_by_refinement", subtract
     )
 
 
-def psf(x: float, y: float, shape: tuple[int, int] = SHAPE) -> NDArray[np.float64]:
+def psf(x, y, shape=SHAPE):
     """A speckled star at (x, y), peak about 1: not round, so that flips and turns show."""
     j, i = np.indices(shape)
     dx, dy = i - x, j - y
@@ -36,12 +30,12 @@ def psf(x: float, y: float, shape: tuple[int, int] = SHAPE) -> NDArray[np.float6
     return np.exp(-r2 / 18) * (1 + 0.3 * np.cos(0.9 * dx + 0.4 * dy)) + 0.02 / (1 + r2 / 60)
 
 
-def planet(x: float, y: float, shape: tuple[int, int] = SHAPE) -> NDArray[np.float64]:
+def planet(x, y, shape=SHAPE):
     j, i = np.indices(shape)
     return np.exp(-((i - x) ** 2 + (j - y) ** 2) / (2 * 1.4**2))
 
 
-def frames(angles: Any, rng: np.random.Generator, noise: float = 0.05) -> NDArray[np.float64]:
+def frames(angles, rng, noise=0.05):
     """Star, background and a companion 12 pixels up on the sky, one frame for each angle."""
     cube = []
     for angle in angles:
@@ -52,7 +46,7 @@ def frames(angles: Any, rng: np.random.Generator, noise: float = 0.05) -> NDArra
     return np.array(cube) + rng.normal(0, noise, (len(cube), *SHAPE))
 
 
-def generic(imgs: NDArray[Any], angles: Any, wvs: Any = None, **kw: Any) -> Any:
+def generic(imgs, angles, wvs=None, **kw):
     """Make a GenericData as in scripts: no FITS header anywhere."""
     from pyklip.instruments.Instrument import GenericData
 
@@ -68,7 +62,7 @@ def generic(imgs: NDArray[Any], angles: Any, wvs: Any = None, **kw: Any) -> Any:
     )
 
 
-def render(observation: Any, opd: OPDMap, settings: DiffrenderSettings) -> Subtraction:
+def render(observation, opd, settings):
     """Least-squares fit of the true star and a background: an honest, tiny subtractor."""
     star = np.empty_like(observation.data)
     chi2 = 0.0
@@ -83,14 +77,7 @@ def render(observation: Any, opd: OPDMap, settings: DiffrenderSettings) -> Subtr
     return Subtraction(star, (fit,))
 
 
-def calints(
-    path: Path,
-    rng: np.random.Generator,
-    roll: float = 0.0,
-    center: tuple[float, float] = (20.7, 25.2),
-    nints: int = 2,
-    **cards: Any,
-) -> NDArray[np.float64]:
+def calints(path, rng, roll=0.0, center=(20.7, 25.2), nints=2, **cards):
     """Write a file as the JWST pipeline does and return its pixels; two pixels are flagged.
 
     `cards` are further ones of the primary header.

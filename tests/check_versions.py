@@ -37,7 +37,7 @@ LENIENT = (
 )
 
 
-def lower_bounds(pyproject: Path = ROOT / "pyproject.toml") -> dict[str, str]:
+def lower_bounds(pyproject=ROOT / "pyproject.toml"):
     """Lower bound of each requirement that a user of the package has, tools aside.
 
     Raises
@@ -57,14 +57,14 @@ def lower_bounds(pyproject: Path = ROOT / "pyproject.toml") -> dict[str, str]:
     return bounds
 
 
-def tools(pyproject: Path = ROOT / "pyproject.toml") -> list[str]:
+def tools(pyproject=ROOT / "pyproject.toml"):
     """Requirements of the extra ``test`` without the extras that it takes along."""
     project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
     own = f"{project['name']}["
     return [each for each in project["optional-dependencies"]["test"] if not each.startswith(own)]
 
 
-def installed(python: Path, names: list[str]) -> dict[str, str]:
+def installed(python, names):
     """Versions in an environment."""
     program = (
         "import json; from importlib.metadata import distributions; "
@@ -75,13 +75,13 @@ def installed(python: Path, names: list[str]) -> dict[str, str]:
     return {name: versions[name.lower()] for name in names if name.lower() in versions}
 
 
-def same(version: str, bound: str) -> bool:
+def same(version, bound):
     """Whether a version is the bound, up to zeros and a local label: 2.10.0+cpu is 2.10."""
     parts = (re.sub(r"(\.0)+$", "", v.split("+")[0]) for v in (version, bound))
     return len(set(parts)) == 1
 
 
-def check(end: str, folder: Path, arguments: list[str]) -> int:
+def check(end, folder, arguments):
     """Make an environment, run pytest in it; returns pytest's exit status."""
     bounds = lower_bounds()
     constraints = folder / "constraints.txt"
@@ -107,7 +107,7 @@ def check(end: str, folder: Path, arguments: list[str]) -> int:
     return subprocess.run([*command, *arguments], cwd=ROOT, env=env, check=False).returncode
 
 
-def main() -> int:
+def main():
     """Run the command line; returns the exit status, 0 if all passed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--end", choices=ENDS, help="default: all, one after the other")

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # Before numpy or torch are imported: thread pools read these once.
@@ -42,7 +41,7 @@ settings.register_profile("quick", deadline=None, derandomize=True, max_examples
 settings.register_profile("full", settings.get_profile("quick"), max_examples=60)
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
+def pytest_addoption(parser):
     parser.addoption(
         "--full",
         action="store_true",
@@ -50,17 +49,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     # Before the test modules are imported, whose settings start from the profile.
     settings.load_profile("full" if config.getoption("--full") else "quick")
 
 
-def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
+def pytest_xdist_auto_num_workers(config):
     """No workers where files or tests are named: starting them would take longer."""
     return None if config.args_source is pytest.Config.ArgsSource.TESTPATHS else 0
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config, items):
     for item in items:
         if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
             item.add_marker("fuzz")
@@ -74,7 +73,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _torch_threads() -> Iterator[None]:
+def _torch_threads():
     """One thread per xdist worker: more would only make the workers wait for each other."""
     before = torch.get_num_threads()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -84,7 +83,7 @@ def _torch_threads() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _forward_mode() -> None:
+def _forward_mode():
     """Torch's own deprecation warning, at its first forward-mode derivative, is behind us.
 
     It compiles its rules by what it calls deprecated.
@@ -95,13 +94,13 @@ def _forward_mode() -> None:
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     """A fresh generator with a fixed seed, the same for every test."""
     return np.random.default_rng(335)
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
+def shared_data():
     """Folder of real frames and wavefront maps, too large to come with the code.
 
     It is ``data`` in the folder named by PYKLIP_DIFFRENDER_SHARED, or in ``shared`` next to the
@@ -121,7 +120,7 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def stpsf_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def stpsf_path(tmp_path_factory):
     """An offline data directory with 256 samples across the pupil, set as STPSF_PATH."""
     if importlib.util.find_spec("stpsf") is None:
         pytest.skip("needs stpsf, the extra 'webbpsf'")
@@ -138,16 +137,15 @@ def stpsf_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture
-def killed() -> Callable[[str, Path], None]:
+def killed():
     """Runs a program with a path, and kills it as soon as it prints a line."""
 
-    def run(program: str, path: Path) -> None:
+    def run(program, path):
         with subprocess.Popen(
             [sys.executable, "-c", textwrap.dedent(program), str(path)],
             stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         ) as process:
-            assert process.stdout is not None
             assert process.stdout.readline() == b"writing\n"
             process.send_signal(signal.SIGKILL)
 

@@ -6,9 +6,7 @@ beyond rounding.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,8 +14,8 @@ from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.linear import ResponseCache, field_derivatives, image_derivatives
-from pyklip_diffrender.optics import OpticalSystem, PointSources, PupilGrid
-from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.optics import PointSources, PupilGrid
+from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior
@@ -46,58 +44,56 @@ VALUES = {
 """Every parameter of the model, off its default."""
 
 
-def model_on(device: Any, **changes: object) -> OpticalSystem:
+def model_on(device, **changes):
     arguments = {"monochromatic": 4.5e-6, "npix": NPIX, "fov_pixels": SIZE, **changes}
-    return dr.nircam_coronagraph("F444W", device=device, **arguments)  # type: ignore[arg-type]
+    return dr.nircam_coronagraph("F444W", device=device, **arguments)
 
 
-def opd() -> Array:
+def opd():
     return dr.random_opd(1, npix=NPIX).data
 
 
-def tensors(model: OpticalSystem) -> dict[str, torch.Tensor]:
+def tensors(model):
     return model.values(VALUES)
 
 
-def frame(k: int = 0, *planets: dr.Planet, **details: object) -> dr.Observation:
+def frame(k=0, *planets, **details):
     """A star through a drifted wavefront, rolled by 20 degrees a frame."""
     scene = dr.Scene(dr.Star(exposure=200.0), planets=planets)
     grid = PupilGrid.full(NPIX)
     drifted = opd() + BASIS.opd(3e-9 * torch.linspace(-1, 1, len(BASIS)), grid).numpy()
     seen = dr.simulate(model_on("cpu"), scene, drifted, seed=3 + k)
-    return replace(seen, position_angles=np.full(len(seen), 20.0 * k), **details)  # type: ignore[arg-type]
+    return replace(seen, position_angles=np.full(len(seen), 20.0 * k), **details)
 
 
-def rolls() -> list[dr.Observation]:
+def rolls():
     """Two rolls of a star with a planet, and a reference star."""
     return [frame(0, PLANET), frame(1, PLANET.rotated(-20.0)), frame(2, reference=True)]
 
 
-def settings(**changes: object) -> GaussNewton:
+def settings(**changes):
     """A fit of all parameters, of the wavefront and of the pupil's amplitude."""
-    chosen: dict[str, object] = {
+    chosen = {
         "free": GaussNewton.nircam().free,
         "basis": BASIS,
         "prior": WavefrontPrior(amplitude_cycles=1.5, amplitude_scale=1.0),
         "response_npix": NPIX,
         **changes,
     }
-    return GaussNewton(**chosen)  # type: ignore[arg-type]
+    return GaussNewton(**chosen)
 
 
-def fitted(
-    device: Any, frames: Sequence[dr.Observation], changes: Any = None, **model: object
-) -> Refinement:
+def fitted(device, frames, changes=None, **model):
     return dr.refine(model_on(device, **model), frames, opd(), settings=settings(**(changes or {})))
 
 
-def reached(fit: Refinement) -> list[float]:
+def reached(fit):
     assert fit.status.usable
     assert np.any(fit.frames[0].coefficients != 0)
     return [fit.chi2_per_pixel, *fit.frames[0].values["star_offset"], fit.frames[0].flux]
 
 
-def search(device: Any, frames: Sequence[dr.Observation], **model: object) -> list[float]:
+def search(device, frames, **model):
     """A joint fit, its search, measurements and limits."""
     changes = {**QUICK, "drift": WavefrontPrior(scales={"texture": 0.05})}
     fit = fitted(device, frames, changes, **model)
@@ -112,45 +108,39 @@ def search(device: Any, frames: Sequence[dr.Observation], **model: object) -> li
     ]
 
 
-def image(device: Any, **changes: object) -> list[Array]:
+def image(device, **changes):
     model = model_on(device, **changes)
     return [model(opd(), **tensors(model)).cpu().numpy()]
 
 
-def gradient(device: Any, **changes: object) -> list[Array]:
+def gradient(device, **changes):
     model = model_on(device, **changes)
     phase = torch.as_tensor(opd(), device=device).requires_grad_()
     values = {name: value.requires_grad_() for name, value in tensors(model).items()}
     model(phase, **values).square().sum().backward()
-    return [each.grad.cpu().numpy().ravel() for each in (phase, *values.values())]  # type: ignore[union-attr]
+    return [each.grad.cpu().numpy().ravel() for each in (phase, *values.values())]
 
 
-def parameter_jacobian(
-    model: OpticalSystem,
-    opd: torch.Tensor,
-    values: dict[str, torch.Tensor],
-    names: tuple[str, ...],
-    fields: Sequence[torch.Tensor] | None = None,
-) -> torch.Tensor:
+def parameter_jacobian(model, opd, values, names, fields=None):
     """Derivatives of the image, (components, ny, nx); the fields may be those of a finer model."""
     slopes = field_derivatives(model, opd, values, names)
     fields = model.fields(opd, **values) if fields is None else fields
     return image_derivatives(model, fields, values, names, slopes)
 
 
-def parameter_derivatives(device: Any, **changes: object) -> list[Array]:
+def parameter_derivatives(device, **changes):
     model = model_on(device, **changes)
     start = torch.as_tensor(opd(), device=device)
     return [parameter_jacobian(model, start, tensors(model), tuple(VALUES)).cpu().numpy()]
 
 
-def point_sources(device: Any, **changes: object) -> list[Array]:
+def point_sources(device, **changes):
     model = model_on(device, **changes)
     sources = PointSources(model, opd(), tensors(model), offset=(0.01, 0.0))
     return [sources.images([3, 12, 20], [12, 12, 4]).cpu().numpy()]
 
 
-def fit_gradient(device: Any, **changes: object) -> list[Array]:
+def fit_gradient(device, **changes):
     """Through the model itself, by everything that a fit may vary."""
     problem = Problem(model_on(device, **changes), frame(), dr.random_opd(1, npix=NPIX))
     solver = Solver([problem], settings(), BASIS, progress=False)
@@ -161,7 +151,7 @@ def fit_gradient(device: Any, **changes: object) -> list[Array]:
     return [each.numpy() for each in slopes.values()]
 
 
-def response(device: Any, **changes: object) -> list[Array]:
+def response(device, **changes):
     """Linearisation about values on the processor, which is where a fit keeps its unknowns."""
     model = model_on(device, **changes)
     values = {name: value.cpu() for name, value in tensors(model).items()}

@@ -23,13 +23,13 @@ SIGMA = 3.2927866
 class SombreroOcculter(poppy.optics.AnalyticImagePlaneElement):
     """MASK335R: t = 1 - (2 J1(s) / s)^2 up to the second zero of J1, clear beyond."""
 
-    def get_transmission(self, wave: poppy.Wavefront) -> Array:
+    def get_transmission(self, wave):
         y, x = self.get_coordinates(wave)
         s = np.clip(SIGMA * np.hypot(y, x), 1e-12, jn_zeros(1, 2)[1])
         return 1 - (2 * j1(s) / s) ** 2
 
 
-def array_optic(name: str, amplitude: Array, opd: Array | None = None) -> poppy.OpticalElement:
+def array_optic(name, amplitude, opd=None):
     """A pupil plane from arrays in the exit-pupil orientation."""
     return poppy.ArrayOpticalElement(
         name=name,
@@ -40,16 +40,7 @@ def array_optic(name: str, amplitude: Array, opd: Array | None = None) -> poppy.
     )
 
 
-def coronagraph(
-    pupil: Array,
-    opd: Array,
-    lyot: Array,
-    internal_opd: Array,
-    *,
-    oversample: int,
-    fov_pixels: int,
-    pixelscale: float,
-) -> poppy.OpticalSystem:
+def coronagraph(pupil, opd, lyot, internal_opd, *, oversample, fov_pixels, pixelscale):
     """Entrance pupil, inversion, occulter, Lyot stop, internal aberration, detector.
 
     Parameters
@@ -70,7 +61,7 @@ def coronagraph(
     return system
 
 
-def image(system: poppy.OpticalSystem, wavelength: float, x: float, y: float) -> Array:
+def image(system, wavelength, x, y):
     """The image of a star at (x, y) arcsec; poppy counts the angle from +y towards -x."""
     system.source_offset_r = np.hypot(x, y)
     system.source_offset_theta = np.rad2deg(np.arctan2(-x, y))
@@ -79,7 +70,7 @@ def image(system: poppy.OpticalSystem, wavelength: float, x: float, y: float) ->
 
 
 @functools.cache
-def lopsided_opd(npix: int) -> Array:
+def lopsided_opd(npix):
     """A wavefront of 60 nm rms without any symmetry, m."""
     axis = (np.arange(npix) - (npix - 1) / 2) / npix
     y, x = axis[:, None], axis[None, :]
@@ -89,12 +80,12 @@ def lopsided_opd(npix: int) -> Array:
 
 
 @functools.cache
-def lopsided_zernikes() -> Array:
+def lopsided_zernikes():
     """36 Noll coefficients, m, each different from zero."""
     return 12e-9 * np.sin(np.arange(36) ** 1.7 + 0.5) / np.sqrt(1 + np.arange(36) / 4)
 
 
-def tabulated(coefficients: Array, wavelength: float) -> Array:
+def tabulated(coefficients, wavelength):
     """What the argument `si_wfe` has to be for a model to have these coefficients at a wavelength.
 
     NIRCam's long-wave focus changes with the wavelength, relative to 3.23 um where its table was
@@ -106,7 +97,7 @@ def tabulated(coefficients: Array, wavelength: float) -> Array:
     return found
 
 
-def zernike_opd(coefficients: Array, npix: int) -> Array:
+def zernike_opd(coefficients, npix):
     """Sum of Noll Zernikes by poppy on the inscribed circle, m.
 
     Left to itself, poppy's function puts the circle through the middles of the outermost pixels.

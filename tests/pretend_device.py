@@ -7,9 +7,7 @@ on both devices, and arrays of numpy that share a tensor's memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,23 +36,23 @@ _INDEXED = (_aten.index.Tensor, _aten.index_put.default, _aten.index_put_.defaul
 class Memory:
     """Knows which memory belongs to the device."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self._held: set[StorageWeakRef] = set()
         self._anywhere: set[StorageWeakRef] = set()
 
-    def holds(self, tensor: Tensor) -> bool | None:
+    def holds(self, tensor):
         """Whether a tensor is on the device; None for a constant that goes with both devices."""
         key = self._key(tensor)
         return None if key in self._anywhere else key in self._held
 
-    def mark(self, tensor: Tensor, held: bool | None) -> None:
+    def mark(self, tensor, held):
         """State where a tensor is."""
         key = self._key(tensor)
         for keys, state in ((self._held, True), (self._anywhere, None)):
             (keys.add if held is state else keys.discard)(key)
 
     @staticmethod
-    def _key(tensor: Tensor) -> StorageWeakRef:
+    def _key(tensor):
         while _functorch.is_functorch_wrapped_tensor(tensor):
             tensor = _functorch.get_unwrapped(tensor)
         return StorageWeakRef(tensor.untyped_storage())
@@ -63,7 +61,7 @@ class Memory:
 class _Operations(TorchDispatchMode):
     """Follows memory through operations."""
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory):
         super().__init__()
         self._memory = memory
         self.computes = False
@@ -72,10 +70,10 @@ class _Operations(TorchDispatchMode):
         """Whether the present call copies to the processor."""
 
     @classmethod
-    def _should_skip_dynamo(cls) -> bool:
+    def _should_skip_dynamo(cls):
         return False  # Its import would take seconds.
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
         tensors = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
         if func not in _COPIES:
@@ -97,7 +95,7 @@ class _Operations(TorchDispatchMode):
                 self._memory.mark(each, held)
         return result
 
-    def _require_one_device(self, func: Any, args: Any, tensors: list[Tensor]) -> None:
+    def _require_one_device(self, func, args, tensors):
         holds = self._memory.holds
         if func in _INDEXED and holds(args[0]):
             tensors = [args[0], *args[2:3]]
@@ -112,16 +110,14 @@ class _Operations(TorchDispatchMode):
 class _Functions(TorchFunctionMode):
     """Says which device a tensor is on, and moves tensors."""
 
-    def __init__(self, memory: Memory, operations: _Operations) -> None:
+    def __init__(self, memory, operations):
         super().__init__()
         self._memory, self._operations = memory, operations
 
-    def __torch_function__(
-        self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
         holds = self._memory.holds
-        if func == Tensor.device.__get__:  # type: ignore[attr-defined]
+        if func == Tensor.device.__get__:
             return DEVICE if holds(args[0]) else _CPU
         if func in (Tensor.numpy, Tensor.__array__) and holds(args[0]):
             raise TypeError("cannot convert a tensor on another device to numpy; use .cpu() first")
@@ -140,7 +136,7 @@ class _Functions(TorchFunctionMode):
         finally:
             self._operations.computes = False
 
-    def _to(self, tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    def _to(self, tensor, *args, **kwargs):
         values = [*args, *kwargs.values()]
         device = DEVICE if self._memory.holds(tensor) else _CPU
         dtype = tensor.dtype
@@ -157,10 +153,10 @@ class _Functions(TorchFunctionMode):
             tensor = self._moved(tensor, DEVICE)
         return tensor.to(dtype)
 
-    def _to_cpu(self, tensor: Tensor) -> Tensor:
+    def _to_cpu(self, tensor):
         return self._moved(tensor, _CPU) if self._memory.holds(tensor) else tensor
 
-    def _moved(self, tensor: Tensor, device: torch.device) -> Tensor:
+    def _moved(self, tensor, device):
         """A copy on the other device, of tangents too; its gradient goes the other way."""
         self._operations.leaves = device == _CPU
         try:
@@ -174,7 +170,7 @@ class _Functions(TorchFunctionMode):
 
 
 @contextmanager
-def pretended() -> Iterator[Memory]:
+def pretended():
     """Inside, `DEVICE` can be used as a device of torch."""
     memory = Memory()
     operations = _Operations(memory)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import poppy
 from astropy import units as u
@@ -20,7 +17,7 @@ _SAMPLINGS = ((24, 1), (32, 2), (36, 3), (24, 4), (28, 2), (30, 3), (26, 2), (27
 Generator = np.random.Generator
 
 
-def draw(generator: Generator) -> poppy.OpticalSystem:
+def draw(generator):
     """Draw a system of up to eight planes between the entrance pupil and the detector."""
     # poppy itself cannot pad an odd number of samples to an even one.
     npix, oversample = _SAMPLINGS[generator.integers(len(_SAMPLINGS))]
@@ -46,12 +43,12 @@ def draw(generator: Generator) -> poppy.OpticalSystem:
     return system
 
 
-def _shifts(generator: Generator, scale: float) -> dict[str, float]:
+def _shifts(generator, scale):
     x, y = generator.normal(scale=scale, size=2)
     return {"shift_x": float(x), "shift_y": float(y)}
 
 
-def _entrance(generator: Generator) -> Any:
+def _entrance(generator):
     return _one_of(
         generator,
         lambda: poppy.optics.ParityTestAperture(name="entrance", radius=3.2 * u.m),
@@ -62,11 +59,11 @@ def _entrance(generator: Generator) -> Any:
     )
 
 
-def _one_of(generator: Generator, *makers: Callable[[], Any]) -> Any:
+def _one_of(generator, *makers):
     return makers[generator.integers(len(makers))]()
 
 
-def _mask(system: poppy.OpticalSystem, generator: Generator, name: str) -> None:
+def _mask(system, generator, name):
     shifts = _shifts(generator, 0.1)
     optic = _one_of(
         generator,
@@ -91,7 +88,7 @@ def _mask(system: poppy.OpticalSystem, generator: Generator, name: str) -> None:
     system.add_image(optic)
 
 
-def _stop(system: poppy.OpticalSystem, generator: Generator, name: str) -> None:
+def _stop(system, generator, name):
     shifts = _shifts(generator, 0.1)
     system.add_pupil(
         _one_of(
@@ -108,7 +105,7 @@ def _stop(system: poppy.OpticalSystem, generator: Generator, name: str) -> None:
     )
 
 
-def _grey(system: poppy.OpticalSystem, generator: Generator, name: str) -> None:
+def _grey(system, generator, name):
     y, x = np.mgrid[: system.npix, : system.npix] / system.npix - 0.5
     factor = float(generator.uniform(0.2, 1))
     system.add_pupil(
@@ -130,13 +127,13 @@ def _grey(system: poppy.OpticalSystem, generator: Generator, name: str) -> None:
     )
 
 
-def _uniform_image(system: poppy.OpticalSystem, generator: Generator, name: str) -> None:
+def _uniform_image(system, generator, name):
     system.add_image(
         poppy.ScalarTransmission(name=name, transmission=float(generator.uniform(0.2, 1)))
     )
 
 
-_KINDS: dict[str, Callable[[poppy.OpticalSystem, Generator, str], None]] = {
+_KINDS = {
     "rotation": lambda system, generator, name: system.add_rotation(
         float(generator.choice([90, 180, -90, generator.uniform(-180, 180)]))
     ),

@@ -8,7 +8,6 @@ Lyot stop lacks one opening, the pupil has an extra obstruction.
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -33,7 +32,7 @@ IPC = np.array([[3.9e-4, 6e-3, 3.8e-4], [5.9e-3, 0.97456, 6e-3], [3.8e-4, 6.1e-3
 PPC = np.array([[0, 0, 0], [0, 0.99877, 0.00123], [0, 0, 0]])
 
 
-def lopsided(npix: int, seed: int, rms: float) -> Array:
+def lopsided(npix, seed, rms):
     """A smooth map of the given rms over the square, m: low-order waves of random phase."""
     rng = np.random.default_rng(seed)
     axis = (np.arange(npix) - (npix - 1) / 2) / npix
@@ -46,7 +45,7 @@ def lopsided(npix: int, seed: int, rms: float) -> Array:
 
 
 @cache
-def pupil(npix: int) -> Array:
+def pupil(npix):
     """Entrance pupil, 0 or 1, with an extra block in the lower left."""
     array = (jwst_pupil(npix) > 0.5).numpy().astype(float)
     array[npix // 4 : npix // 4 + npix // 10, npix // 5 : npix // 5 + npix // 12] = 0
@@ -54,7 +53,7 @@ def pupil(npix: int) -> Array:
 
 
 @cache
-def segments(npix: int) -> Array:
+def segments(npix):
     """Number of the segment, 1 to 18, at every sample."""
     labels = np.zeros((npix, npix))
     for number, outline in enumerate(jwst_segments().values(), start=1):
@@ -63,18 +62,18 @@ def segments(npix: int) -> Array:
 
 
 @cache
-def lyot_stop(npix: int) -> Array:
+def lyot_stop(npix):
     """MASKRND without its first opening, entrance-pupil orientation."""
     return polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy()
 
 
-def _image(path: Path, data: NDArray[np.generic], npix: int, **keywords: object) -> None:
+def _image(path, data, npix, **keywords):
     header = fits.Header({**keywords, "PUPLSCAL": JWST_DIAMETER / npix, "PUPLDIAM": JWST_DIAMETER})
     path.parent.mkdir(parents=True, exist_ok=True)
     fits.PrimaryHDU(data, header).writeto(path)
 
 
-def _zernike_table(path: Path, seed: int) -> None:
+def _zernike_table(path, seed):
     rng = np.random.default_rng(seed)
     rows = []
     corners = {"A": (0.2, 2.7), "B": (-2.7, -0.2)}
@@ -90,7 +89,7 @@ def _zernike_table(path: Path, seed: int) -> None:
     Table(rows=rows, names=names).write(path)
 
 
-def _field_dependence(path: Path, seed: int) -> None:
+def _field_dependence(path, seed):
     rng = np.random.default_rng(seed)
     keywords = {
         "INSTR": "NIRCam",
@@ -118,13 +117,13 @@ def _field_dependence(path: Path, seed: int) -> None:
     hdus.writeto(path)
 
 
-def _kernels(path: Path, kernel: Array) -> None:
+def _kernels(path, kernel):
     path.parent.mkdir(parents=True, exist_ok=True)
     cubes = [fits.ImageHDU(kernel[None], name=sensor) for sensor in SENSORS]
     fits.HDUList([fits.PrimaryHDU(), *cubes]).writeto(path)
 
 
-def _filter(path: Path, name: str) -> None:
+def _filter(path, name):
     if name == "F200W":  # stpsf wants it to exist; nothing here looks through it.
         wavelength, throughput = np.linspace(1.7e-6, 2.3e-6, 50), np.ones(50)
         throughput[[0, -1]] = 0
@@ -138,7 +137,7 @@ def _filter(path: Path, name: str) -> None:
     fits.HDUList([fits.PrimaryHDU(), table]).writeto(path)
 
 
-def wss_file(path: Path, seed: int = 5, date: str = "2022-08-11T02:00:00") -> None:
+def wss_file(path, seed=5, date="2022-08-11T02:00:00"):
     """A wavefront-sensing product as MAST has it: 256 x 256, microns, 0 where there is none."""
     opd = lopsided(256, seed, 0.07) * pupil(256)
     primary = fits.PrimaryHDU(
@@ -149,7 +148,7 @@ def wss_file(path: Path, seed: int = 5, date: str = "2022-08-11T02:00:00") -> No
     fits.HDUList(hdus).writeto(path)
 
 
-def make_stpsf_data(folder: Path, npix: int = 256) -> Path:
+def make_stpsf_data(folder, npix=256):
     """Write the directory.
 
     Parameters
@@ -195,6 +194,6 @@ def make_stpsf_data(folder: Path, npix: int = 256) -> Path:
     return folder
 
 
-def zernike_tensor(seed: int) -> torch.Tensor:
+def zernike_tensor(seed):
     """36 small Noll coefficients, m."""
     return torch.from_numpy(np.random.default_rng(seed).normal(scale=5e-9, size=36))

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
-from pyklip_diffrender.surveys.jobs import Job
-
 __all__ = ["HOSTILE", "configuration", "inputs", "result", "stub"]
 
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>'
 
 
-def inputs(folder: Path, count: int = 3) -> dict[str, Any]:
+def inputs(folder, count=3):
     """Write small files and return a configuration with one sequence for each."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "opd.fits").write_bytes(b"a map")
@@ -25,7 +20,7 @@ def inputs(folder: Path, count: int = 3) -> dict[str, Any]:
     return {"workers": 0, "sequence": sequences}
 
 
-def configuration(path: Path, content: dict[str, Any]) -> Path:
+def configuration(path, content):
     """Write a configuration of `inputs` as TOML."""
     lines = [f"workers = {content['workers']}"]
     for each in content["sequence"]:
@@ -34,7 +29,7 @@ def configuration(path: Path, content: dict[str, Any]) -> Path:
     return path
 
 
-def result(target: str = "HD 1") -> dict[str, Any]:
+def result(target="HD 1"):
     """What a reduction says, with one candidate."""
     candidate = {
         "separation_arcsec": 0.82, "separation_error_arcsec": 0.004, "position_angle_deg": 149.9,
@@ -53,7 +48,7 @@ def result(target: str = "HD 1") -> dict[str, Any]:
     }  # fmt: skip
 
 
-def stub(job: Job, folder: Path) -> dict[str, Any]:
+def stub(job, folder):
     """A job that takes no time."""
     (folder / "report.html").write_text("<p>report</p>", encoding="utf-8")
     recovered = {"contrast": 1.1e-5, "contrast_error": 2e-6, "snr": 6.0, "detected": True}

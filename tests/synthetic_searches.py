@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from astropy.io import fits
@@ -28,7 +26,7 @@ CURVATURE = 1 / (2 * (SMOOTH * PIXEL) ** 2)
 Image = NDArray[np.float64]
 
 
-def noise(seed: int, side: int) -> Image:
+def noise(seed, side):
     """Smooth noise of standard deviation 1, (side, side)."""
     white = np.random.default_rng(seed).normal(size=(side + 20, side + 20))
     smooth = gaussian_filter(white, SMOOTH, mode="wrap")
@@ -40,21 +38,21 @@ def noise(seed: int, side: int) -> Image:
 
 
 def searched(
-    filter: str = "F444W",
-    seed: int = 0,
-    sources: Sequence[tuple[float, float, float]] = (),
+    filter="F444W",
+    seed=0,
+    sources=(),
     *,
-    mjd: float = 60000.0,
-    north: float | None = 0.0,
-    error: float = 1e-6,
-    side: int = 41,
-    star: float | None = 1.0,
-    status: str = "CONVERGED",
-    header: dict[str, object] | None = None,
-    known: bool = False,
-    freedom: float = np.inf,
-    factor: float = 1.0,
-) -> Detection:
+    mjd=60000.0,
+    north=0.0,
+    error=1e-6,
+    side=41,
+    star=1.0,
+    status="CONVERGED",
+    header=None,
+    known=False,
+    freedom=np.inf,
+    factor=1.0,
+):
     """A detection whose map has noise, and sources of an S/N at offsets to the east and north.
 
     With `known`, the sources are candidates of the search itself.

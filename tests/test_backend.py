@@ -7,9 +7,6 @@ import ctypes
 import inspect
 import io
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,17 +31,13 @@ from pyklip.klip import high_pass_filter
 # As a script does it, long before the plugin is imported.
 from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender import backend as backend_module_or_function
 from pyklip_diffrender.errors import (
-    CorruptFileError,
     DiffrenderWarning,
     IncompatibleSetupError,
     MissingOPDError,
-    NonFiniteError,
     NoValidPixelsError,
     RefinementError,
     ShapeError,
-    UnitError,
 )
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
@@ -64,18 +57,18 @@ pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarni
 
 
 @pytest.fixture
-def registered() -> Iterator[None]:
+def registered():
     register(opd=OPD, subtractor=render)
     yield
     unregister()
 
 
 @pytest.fixture
-def imgs(rng: np.random.Generator) -> np.ndarray:
+def imgs(rng):
     return frames(ANGLES, rng)
 
 
-def reduce(dataset: Any, folder: Path, prefix: str = "x", **kw: Any) -> dict[str, Any]:
+def reduce(dataset, folder, prefix="x", **kw):
     """Run klip_dataset and give name -> (data, header) of all files it left."""
     folder.mkdir(exist_ok=True)
     options = {
@@ -88,7 +81,7 @@ def reduce(dataset: Any, folder: Path, prefix: str = "x", **kw: Any) -> dict[str
     }
 
 
-def library(dataset: Any, imgs: np.ndarray, highpass: bool = False) -> Any:
+def library(dataset, imgs, highpass=False):
     """A PSF library of the dataset's own frames and four of a reference star."""
     rng = np.random.default_rng(1)
     references = [900 * psf(*CENTER) + rng.normal(0, 1, SHAPE) for _ in range(4)]
@@ -104,9 +97,9 @@ def library(dataset: Any, imgs: np.ndarray, highpass: bool = False) -> Any:
     return made
 
 
-def spied(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def spied(monkeypatch):
     """All that is exchanged in pyKLIP, for a comparison by identity."""
-    found: dict[str, Any] = {}
+    found = {}
     for function in (parallelized.klip_dataset, fm.klip_dataset):
         name = f"{function.__module__}.{function.__qualname__}"
         found[name] = function
@@ -121,7 +114,7 @@ def spied(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return found
 
 
-def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+def same(a, b):
     return a.keys() == b.keys() and all(
         a[k] == b[k] if isinstance(a[k], dict) else a[k] is b[k] for k in a
     )
@@ -130,7 +123,7 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
 # Registration
 
 
-def test_unregister_puts_back_the_same_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unregister_puts_back_the_same_objects(monkeypatch):
     before = spied(monkeypatch)
     assert not is_registered()
     register(opd=OPD)
@@ -147,7 +140,7 @@ def test_unregister_puts_back_the_same_objects(monkeypatch: pytest.MonkeyPatch) 
     assert same(before, spied(monkeypatch))
 
 
-def test_the_signature_that_help_shows_stays(registered: None) -> None:
+def test_the_signature_that_help_shows_stays(registered):
     unregister()
     before = inspect.signature(klip_dataset)
     register(opd=OPD)
@@ -158,8 +151,8 @@ def test_the_signature_that_help_shows_stays(registered: None) -> None:
         klip_dataset()
 
 
-def test_a_pyklip_that_changed_is_refused_and_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    def klip_dataset(dataset: Any, algo: str = "klip") -> None: ...
+def test_a_pyklip_that_changed_is_refused_and_left_alone(monkeypatch):
+    def klip_dataset(dataset, algo="klip"): ...
 
     monkeypatch.setattr(parallelized, "klip_dataset", klip_dataset)
     code = klip_dataset.__code__
@@ -172,7 +165,7 @@ def test_a_pyklip_that_changed_is_refused_and_left_alone(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("algo", ["klip", "empca", "none"])
-def test_other_algorithms_are_bit_identical(algo: str, imgs: np.ndarray, tmp_path: Path) -> None:
+def test_other_algorithms_are_bit_identical(algo, imgs, tmp_path):
     results = []
     for i in range(3):
         if i == 1:
@@ -212,8 +205,8 @@ def test_other_algorithms_are_bit_identical(algo: str, imgs: np.ndarray, tmp_pat
     ],
 )
 def test_every_file_keyword_and_slice_is_there_as_klip_leaves_it(
-    mode: str, wvs: Any, collapse: str, save_ints: bool, imgs: np.ndarray, tmp_path: Path
-) -> None:
+    mode, wvs, collapse, save_ints, imgs, tmp_path
+):
     if wvs is not None and len(set(wvs)) > 1:
         # As many frames at each wavelength.
         imgs, angles = np.repeat(imgs, 2, axis=0), np.repeat(ANGLES, 2)
@@ -257,9 +250,7 @@ def test_every_file_keyword_and_slice_is_there_as_klip_leaves_it(
 
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("highpass", [False, 8.0])
-def test_both_algorithms_in_one_call(
-    highpass: float | bool, imgs: np.ndarray, tmp_path: Path
-) -> None:
+def test_both_algorithms_in_one_call(highpass, imgs, tmp_path):
     alone = {algo: (generic(imgs, ANGLES), tmp_path / algo) for algo in ("klip", "diffrender")}
     expected = {
         algo: reduce(*each, algo=algo, highpass=highpass)["x-KLmodes-all.fits"][0]
@@ -285,9 +276,7 @@ def test_both_algorithms_in_one_call(
 
 
 @pytest.mark.usefixtures("registered")
-def test_the_companion_stays_whole_and_the_star_and_the_pedestal_go(
-    imgs: np.ndarray, tmp_path: Path
-) -> None:
+def test_the_companion_stays_whole_and_the_star_and_the_pedestal_go(imgs, tmp_path):
     dataset = generic(imgs, ANGLES)
     files = reduce(dataset, tmp_path, aligned_center=CENTER)
     image, _ = files["x-KLmodes-all.fits"]
@@ -303,7 +292,7 @@ def test_the_companion_stays_whole_and_the_star_and_the_pedestal_go(
 
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("outer", [None, 15.0])
-def test_nan_where_pyklip_has_nan(outer: float | None, imgs: np.ndarray, tmp_path: Path) -> None:
+def test_nan_where_pyklip_has_nan(outer, imgs, tmp_path):
     imgs[0, 20, 30] = imgs[1, 5:8, 5] = np.nan
     masks = []
     for algo in ("none", "diffrender"):
@@ -317,7 +306,7 @@ def test_nan_where_pyklip_has_nan(outer: float | None, imgs: np.ndarray, tmp_pat
 
 
 @pytest.mark.usefixtures("registered")
-def test_frames_padded_with_nan(imgs: np.ndarray, tmp_path: Path) -> None:
+def test_frames_padded_with_nan(imgs, tmp_path):
     plain = generic(imgs, ANGLES)
     reduce(plain, tmp_path / "a", aligned_center=CENTER)
     pad = 16
@@ -338,7 +327,7 @@ def test_frames_padded_with_nan(imgs: np.ndarray, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("mode", ["RDI", "ADI", "ADI+RDI"])
-def test_a_single_frame_without_header(mode: str, imgs: np.ndarray, tmp_path: Path) -> None:
+def test_a_single_frame_without_header(mode, imgs, tmp_path):
     dataset = generic(imgs[:1], [0.0])
     kw = {"psf_library": library(dataset, imgs[:1])} if "RDI" in mode else {}
     files = reduce(dataset, tmp_path, mode=mode, numbasis=1, **kw)
@@ -349,7 +338,7 @@ def test_a_single_frame_without_header(mode: str, imgs: np.ndarray, tmp_path: Pa
 
 
 @pytest.mark.usefixtures("registered")
-def test_lite_and_double_precision_and_no_derotation(imgs: np.ndarray, tmp_path: Path) -> None:
+def test_lite_and_double_precision_and_no_derotation(imgs, tmp_path):
     outputs = []
     for kw in ({}, {"lite": True}, {"dtype": ctypes.c_double}, {"skip_derot": True}):
         dataset = generic(imgs, ANGLES)
@@ -363,22 +352,8 @@ def test_lite_and_double_precision_and_no_derotation(imgs: np.ndarray, tmp_path:
 
 
 @pytest.mark.usefixtures("registered")
-def test_aligned_frames_are_saved_as_by_klip(imgs: np.ndarray, tmp_path: Path) -> None:
-    saved = []
-    for algo in ("klip", "diffrender"):
-        dataset = generic(imgs, ANGLES)
-        center = np.array([20.0, 22.0])
-        reduce(dataset, tmp_path / algo, algo=algo, save_aligned=True, aligned_center=center)
-        saved.append(dataset.aligned_and_scaled)
-    assert saved[0].dtype == saved[1].dtype
-    np.testing.assert_allclose(saved[0], saved[1], rtol=1e-5, equal_nan=True)
-
-
-@pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("highpass", [True, 12.0])
-def test_high_pass_filter_acts_after_the_fit(
-    highpass: bool | float, imgs: np.ndarray, tmp_path: Path
-) -> None:
+def test_high_pass_filter_acts_after_the_fit(highpass, imgs, tmp_path):
     plain, filtered = generic(imgs, ANGLES), generic(imgs, ANGLES)
     reduce(plain, tmp_path / "a", skip_derot=True, aligned_center=CENTER)
     reduce(filtered, tmp_path / "b", skip_derot=True, aligned_center=CENTER, highpass=highpass)
@@ -393,18 +368,10 @@ def test_high_pass_filter_acts_after_the_fit(
         reduce(copy.deepcopy(filtered), tmp_path / "c")
 
 
-def test_a_filter_by_klip_is_noticed_too(imgs: np.ndarray, tmp_path: Path) -> None:
-    with backend(opd=OPD, subtractor=render, force=False):
-        dataset = generic(imgs, ANGLES)
-        reduce(dataset, tmp_path, algo="klip", highpass=True)
-        with pytest.raises(IncompatibleSetupError, match="high-pass"):
-            reduce(dataset, tmp_path)
-
-
 # Where settings come from
 
 
-def test_a_missing_opd_is_an_error_that_says_what_to_do(imgs: np.ndarray, tmp_path: Path) -> None:
+def test_a_missing_opd_is_an_error_that_says_what_to_do(imgs, tmp_path):
     dataset = generic(imgs, ANGLES)
     before = dict(vars(dataset))
     register(subtractor=render)
@@ -417,9 +384,9 @@ def test_a_missing_opd_is_an_error_that_says_what_to_do(imgs: np.ndarray, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_block_wins_over_dataset_over_register(imgs: np.ndarray, tmp_path: Path) -> None:
-    def marked(n: int) -> Any:
-        def fake(observation: Any, opd: Any, settings: DiffrenderSettings) -> Subtraction:
+def test_block_wins_over_dataset_over_register(imgs, tmp_path):
+    def marked(n):
+        def fake(observation, opd, settings):
             found = render(observation, opd, settings)
             fit = Fit((0,), str(settings.model_options), 1.0)
             return Subtraction(found.star, (fit,), references=n)
@@ -447,8 +414,8 @@ def test_block_wins_over_dataset_over_register(imgs: np.ndarray, tmp_path: Path)
         reduce(dataset, tmp_path)
 
 
-def test_block_takes_over_klip_and_nothing_else(imgs: np.ndarray, tmp_path: Path) -> None:
-    def stamped(**kw: Any) -> bool:
+def test_block_takes_over_klip_and_nothing_else(imgs, tmp_path):
+    def stamped(**kw):
         return "DRALGO" in reduce(generic(imgs, ANGLES), tmp_path, **kw)["x-KLmodes-all.fits"][1]
 
     with backend("diffrender", opd=OPD, subtractor=render):
@@ -464,10 +431,8 @@ def test_block_takes_over_klip_and_nothing_else(imgs: np.ndarray, tmp_path: Path
         reduce(generic(imgs, ANGLES), tmp_path)
 
 
-def test_klip_on_a_dataset_that_was_reduced_here_says_so_once(
-    imgs: np.ndarray, tmp_path: Path
-) -> None:
-    def klipped(dataset: Any) -> bool:
+def test_klip_on_a_dataset_that_was_reduced_here_says_so_once(imgs, tmp_path):
+    def klipped(dataset):
         header = reduce(dataset, tmp_path, algo="klip")["x-KLmodes-all.fits"][1]
         return "DRALGO" not in header
 
@@ -506,13 +471,13 @@ def test_klip_on_a_dataset_that_was_reduced_here_says_so_once(
 
 
 @pytest.mark.parametrize("kind", ["array", "quantity", "file", "path"])
-def test_the_kinds_of_opd_and_their_provenance(kind: str, imgs: np.ndarray, tmp_path: Path) -> None:
+def test_the_kinds_of_opd_and_their_provenance(kind, imgs, tmp_path):
     path = tmp_path / "R2022073003.fits"
     fits.PrimaryHDU(RIPPLE * 1e6, fits.Header({"BUNIT": "um"})).writeto(path)
     opd = {"array": RIPPLE, "quantity": RIPPLE * 1e9 * u.nm, "file": str(path), "path": path}[kind]
     seen = []
 
-    def fake(observation: Any, opd: Any, settings: Any) -> Subtraction:
+    def fake(observation, opd, settings):
         seen.append(np.asarray(opd))
         return render(observation, opd, settings)
 
@@ -530,22 +495,6 @@ def test_the_kinds_of_opd_and_their_provenance(kind: str, imgs: np.ndarray, tmp_
     assert "frames 0, 1" in history
 
 
-def test_bad_opds(imgs: np.ndarray, tmp_path: Path) -> None:
-    truncated = tmp_path / "t.fits"
-    fits.PrimaryHDU(RIPPLE, fits.Header({"BUNIT": "m"})).writeto(truncated)
-    truncated.write_bytes(truncated.read_bytes()[:-9000])
-    for opd, error in (
-        (tmp_path / "no.fits", CorruptFileError),
-        (truncated, CorruptFileError),
-        (RIPPLE * u.s, UnitError),
-        (RIPPLE[:3], ShapeError),
-        (RIPPLE * np.nan, NonFiniteError),
-    ):
-        with pytest.raises(error, match=r"array|opd|fits"), backend(opd=opd, subtractor=render):
-            reduce(generic(imgs, ANGLES), tmp_path / "out")
-        assert list((tmp_path / "out").iterdir()) == []
-
-
 # Bad input and failures
 
 
@@ -560,9 +509,7 @@ def test_bad_opds(imgs: np.ndarray, tmp_path: Path) -> None:
         ({"annuli": 100}, ValueError, "Too many annuli"),
     ],
 )
-def test_arguments_that_make_no_sense(
-    change: dict[str, Any], error: type[Exception], message: str, imgs: np.ndarray, tmp_path: Path
-) -> None:
+def test_arguments_that_make_no_sense(change, error, message, imgs, tmp_path):
     dataset = generic(imgs, ANGLES)
     before = dict(vars(dataset))
     with pytest.raises(error, match=message):
@@ -573,7 +520,7 @@ def test_arguments_that_make_no_sense(
 
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("mode", ["ADI", "ADI+SDI"])
-def test_a_dataset_without_frames(mode: str, tmp_path: Path) -> None:
+def test_a_dataset_without_frames(mode, tmp_path):
     dataset = generic(np.zeros((0, *SHAPE)), [], center=np.zeros((0, 2)))
     dataset.centers = np.zeros((0, 2))
     with pytest.raises(NoValidPixelsError, match="no frames"):
@@ -583,7 +530,7 @@ def test_a_dataset_without_frames(mode: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("registered")
-def test_masked_frames(imgs: np.ndarray, tmp_path: Path) -> None:
+def test_masked_frames(imgs, tmp_path):
     with pytest.raises(NoValidPixelsError, match=r"frame0.*nothing is left to fit"):
         reduce(generic(imgs * np.nan, ANGLES), tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -594,24 +541,13 @@ def test_masked_frames(imgs: np.ndarray, tmp_path: Path) -> None:
     np.testing.assert_array_equal(finite, [True, False, True])
 
 
-@pytest.mark.usefixtures("registered")
-def test_a_missing_folder_is_found_before_the_fit(imgs: np.ndarray, tmp_path: Path) -> None:
-    def fake(*args: Any) -> Subtraction:
-        raise AssertionError("fitted for nothing")
-
-    with backend(subtractor=fake), pytest.raises(FileNotFoundError, match="not a folder"):
-        klip_dataset(generic(imgs, ANGLES), outputdir=tmp_path / "no", algo="diffrender")
-
-
 @pytest.mark.parametrize("where", ["fit", "shape", "nothing", "writing"])
-def test_a_failure_raises_and_leaves_everything_as_it_was(
-    where: str, imgs: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failure_raises_and_leaves_everything_as_it_was(where, imgs, tmp_path, monkeypatch):
     before = spied(monkeypatch)
     dataset = generic(imgs, ANGLES, wvs=[4.0, 4.4, 4.8])
     calls = []
 
-    def fake(observation: Any, opd: Any, settings: Any) -> Subtraction:
+    def fake(observation, opd, settings):
         calls.append(observation)
         found = render(observation, opd, settings)
         if len(calls) == 3 and where == "fit":
@@ -622,7 +558,7 @@ def test_a_failure_raises_and_leaves_everything_as_it_was(
     if where == "writing":
         save = dataset.savedata
 
-        def savedata(path: str, *args: Any, **kw: Any) -> None:
+        def savedata(path, *args, **kw):
             save(path, *args, **kw)
             if "KLmodes" in path:
                 raise OSError("no space left on device")
@@ -640,12 +576,10 @@ def test_a_failure_raises_and_leaves_everything_as_it_was(
     assert same(before, spied(monkeypatch))
 
 
-def test_threads_and_errors_while_the_console_is_silenced(
-    imgs: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_threads_and_errors_while_the_console_is_silenced(imgs, tmp_path, monkeypatch):
     seen, screen = [], io.StringIO()
 
-    def fails(observation: Any, opd: Any, settings: Any) -> Subtraction:
+    def fails(observation, opd, settings):
         seen.append(torch.get_num_threads())
         assert not list(tmp_path.iterdir())  # Or a process that is killed would leave a folder.
         raise RefinementError("diverged", None)
@@ -663,14 +597,14 @@ def test_threads_and_errors_while_the_console_is_silenced(
 
 
 @pytest.mark.usefixtures("registered")
-def test_one_model_for_several_wavelengths_is_refused(imgs: np.ndarray, tmp_path: Path) -> None:
+def test_one_model_for_several_wavelengths_is_refused(imgs, tmp_path):
     seen = []
 
-    def fake(observation: Any, opd: Any, settings: DiffrenderSettings) -> Subtraction:
+    def fake(observation, opd, settings):
         seen.append(settings.model)
         return render(observation, opd, settings)
 
-    def dataset() -> Any:
+    def dataset():
         return generic(imgs[:2], ANGLES[:2], wvs=[4.0, 4.4])
 
     with pytest.raises(IncompatibleSetupError, match="mapping"), backend(model="a"):
@@ -685,15 +619,13 @@ def test_one_model_for_several_wavelengths_is_refused(imgs: np.ndarray, tmp_path
 
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("wvs", [(4.0, 4.0, 4.4, 4.4), (4.0, 4.4, 4.0)])
-def test_wavelengths_that_pyklip_would_mix_up_are_refused(
-    wvs: tuple[float, ...], imgs: np.ndarray, tmp_path: Path
-) -> None:
+def test_wavelengths_that_pyklip_would_mix_up_are_refused(wvs, imgs, tmp_path):
     cube = np.tile(imgs[0], (len(wvs), 1, 1))
     with pytest.raises(IncompatibleSetupError, match="one dataset for each filter"):
         reduce(generic(cube, np.zeros(len(wvs)), wvs), tmp_path, mode="ADI+SDI")
 
 
-def test_no_filter_and_no_model(imgs: np.ndarray, tmp_path: Path) -> None:
+def test_no_filter_and_no_model(imgs, tmp_path):
     with pytest.raises(IncompatibleSetupError, match="through which filter"), backend(opd=OPD):
         reduce(generic(imgs, ANGLES), tmp_path)
 
@@ -701,7 +633,7 @@ def test_no_filter_and_no_model(imgs: np.ndarray, tmp_path: Path) -> None:
 # Observations
 
 
-def test_observation_from_a_dataset_without_headers(imgs: np.ndarray) -> None:
+def test_observation_from_a_dataset_without_headers(imgs):
     imgs[0, 3, 4] = np.nan
     dataset = generic(imgs, ANGLES)
     observation = observation_from_dataset(dataset)
@@ -717,7 +649,7 @@ def test_observation_from_a_dataset_without_headers(imgs: np.ndarray) -> None:
     assert np.nanmedian(observation.data) > BACKGROUND
 
 
-def test_errors_that_are_given(imgs: np.ndarray) -> None:
+def test_errors_that_are_given(imgs):
     dataset = generic(imgs, ANGLES)
     for error in (0.5, np.full(SHAPE, 0.5), np.full(imgs.shape, 0.5)):
         dataset.diffrender = DiffrenderSettings(error=error, filter="F444W", unit=u.Jy)
@@ -728,16 +660,3 @@ def test_errors_that_are_given(imgs: np.ndarray) -> None:
     dataset.diffrender = DiffrenderSettings(error=np.zeros(7))
     with pytest.raises(ShapeError, match="expected a number"):
         observation_from_dataset(dataset)
-
-
-def test_which_wavelength(imgs: np.ndarray) -> None:
-    dataset = generic(imgs, ANGLES, wvs=[4.0, 4.4, 4.4])
-    with pytest.raises(IncompatibleSetupError, match="choose one"):
-        observation_from_dataset(dataset)
-    with pytest.raises(IncompatibleSetupError, match="the dataset has"):
-        observation_from_dataset(dataset, 3.0)
-    assert len(observation_from_dataset(dataset, 4.4).data) == 2
-
-
-def test_the_package_attribute_is_the_function() -> None:
-    assert backend_module_or_function is backend

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +30,7 @@ class PipelineData(Data):
     # What `Data` declares abstract: each pipeline stores it as it likes.
     input = centers = filenums = filenames = PAs = wvs = wcs = IWA = output = None
 
-    def __init__(self, images: Any, references: Any) -> None:
+    def __init__(self, images, references):
         super().__init__()
         self.readdata(images)
         count = len(references)
@@ -43,7 +40,7 @@ class PipelineData(Data):
         )
         self._psflib.prepare_library(self)
 
-    def readdata(self, images: Any) -> None:
+    def readdata(self, images):
         count = len(images)
         self.input = np.array(images)
         self.centers = np.tile(CENTER, (count, 1))
@@ -56,20 +53,20 @@ class PipelineData(Data):
         self.flipx = False
 
     def savedata(
-        self, filepath: str, data: Any, klipparams: Any = None, filetype: str = "",
-        zaxis: Any = None, more_keywords: Any = None,
-    ) -> None:  # fmt: skip
+        self, filepath, data, klipparams = None, filetype = "",
+        zaxis = None, more_keywords = None,
+    ):  # fmt: skip
         header = fits.Header({"PIPELINE": "ours", "PSFPARAM": klipparams, "FILETYPE": filetype})
         header["PSFCENTX"], header["PSFCENTY"] = self.output_centers[0]
         header.update({f"KLMODE{k}": mode for k, mode in enumerate(() if zaxis is None else zaxis)})
         fits.PrimaryHDU(data.astype(np.float32), header).writeto(filepath, overwrite=True)
 
-    def calibrate_output(self, img: Any, spectral: bool = False, units: str = "contrast") -> Any:
+    def calibrate_output(self, img, spectral=False, units="contrast"):
         return img
 
 
 @pytest.mark.parametrize("mode", ["ADI", "RDI", "ADI+RDI"])
-def test_a_pipelines_own_dataset(mode: str, rng: np.random.Generator, tmp_path: Path) -> None:
+def test_a_pipelines_own_dataset(mode, rng, tmp_path):
     images = frames(ANGLES, rng)
     star = 900 * psf(*CENTER) + rng.normal(0, 0.05, (4, *SHAPE))
     dataset = PipelineData(images, star)
@@ -102,7 +99,7 @@ def test_a_pipelines_own_dataset(mode: str, rng: np.random.Generator, tmp_path: 
 
 
 @pytest.fixture
-def start_method(request: pytest.FixtureRequest) -> Iterator[str]:
+def start_method(request):
     before = multiprocessing.get_start_method(allow_none=True)
     multiprocessing.set_start_method(request.param, force=True)
     yield request.param
@@ -112,9 +109,7 @@ def start_method(request: pytest.FixtureRequest) -> Iterator[str]:
 @pytest.mark.parametrize(
     "start_method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)], indirect=True
 )
-def test_the_start_method_of_processes_changes_nothing(
-    start_method: str, rng: np.random.Generator, tmp_path: Path
-) -> None:
+def test_the_start_method_of_processes_changes_nothing(start_method, rng, tmp_path):
     """pyKLIP turns frames in a pool, and measures their noise in one for weighted means.
 
     Processes of a fork server know no more than those that are spawned.

@@ -6,10 +6,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from backend_scene import OPD, frames, generic, render
 from pyklip.parallelized import klip_dataset
@@ -21,10 +18,10 @@ from pyklip_diffrender.pyklip_backend.child import spawned_beside_klip
 VARIABLE = "PYKLIP_DIFFRENDER_TAKES_KLIP"
 
 
-def call(rng: np.random.Generator, folder: Path, algo: str) -> Any:
+def call(rng, folder, algo):
     """Run `klip_dataset` in another thread; returns what it raised."""
     dataset = generic(frames([0.0, 30.0], rng), [0.0, 30.0])
-    options: dict[str, Any] = {
+    options = {
         "mode": "ADI", "outputdir": str(folder), "annuli": 1, "subsections": 1, "numbasis": [1],
         "numthreads": 1, "verbose": False, "algo": algo,
     }  # fmt: skip
@@ -33,9 +30,7 @@ def call(rng: np.random.Generator, folder: Path, algo: str) -> Any:
 
 
 @pytest.mark.parametrize("algo", ["klip", "diffrender"])
-def test_a_block_of_another_thread_is_mentioned(
-    algo: str, rng: np.random.Generator, tmp_path: Path
-) -> None:
+def test_a_block_of_another_thread_is_mentioned(algo, rng, tmp_path):
     # Warnings are errors here, so that KLIP does not run.
     with backend(opd=OPD, subtractor=render):
         raised = call(rng, tmp_path, algo)
@@ -43,7 +38,7 @@ def test_a_block_of_another_thread_is_mentioned(
     assert "in this thread" in str(raised)
 
 
-def test_what_is_registered_holds_in_threads(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_what_is_registered_holds_in_threads(rng, tmp_path):
     register(opd=OPD, subtractor=render, replace=True)
     try:
         assert call(rng, tmp_path, "klip") is None
@@ -52,7 +47,7 @@ def test_what_is_registered_holds_in_threads(rng: np.random.Generator, tmp_path:
     assert (tmp_path / "-KLmodes-all.fits").is_file()
 
 
-def test_who_takes_calls_of_klip_is_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_takes_calls_of_klip_is_in_the_environment(monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
     with backend(opd=OPD, force=False):
         assert VARIABLE not in os.environ
@@ -90,7 +85,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_a_spawned_process_says_that_it_runs_klip(tmp_path: Path) -> None:
+def test_a_spawned_process_says_that_it_runs_klip(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT, encoding="utf-8")
     done = subprocess.run(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Callable
-from typing import Any
 
 import astropy.units as u
 import numpy as np
@@ -15,15 +13,11 @@ import pytest
 import random_poppy
 import torch
 from astropy.io import fits
-from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 
 from pyklip_diffrender.bridges import from_poppy, opd_to_poppy
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.optics.grid import resample
-
-Array = NDArray[np.float64]
-Plane = tuple[str, Any]
 
 DETECTOR = {"pixelscale": 0.05, "fov_pixels": 40, "oversample": 2}
 WAVELENGTH = 4.5e-6
@@ -38,7 +32,7 @@ pytestmark = [
 ]
 
 
-def make(*planes: Plane, oversample: int = 2, detector: dict[str, Any] | None = None) -> Any:
+def make(*planes, oversample=2, detector=None):
     system = poppy.OpticalSystem(oversample=oversample, npix=NPIX, verbose=False)
     system.pupil_diameter = 6.5 * u.m
     add = {
@@ -54,48 +48,48 @@ def make(*planes: Plane, oversample: int = 2, detector: dict[str, Any] | None = 
     return system
 
 
-def pupil() -> Plane:
+def pupil():
     return "pupil", poppy.optics.ParityTestAperture(name="entrance", radius=3.2 * u.m)
 
 
-def zernikes() -> Plane:
+def zernikes():
     coefficients = [0, 1e-7, -5e-8, 2e-7, 1e-7, 5e-8, 1e-7, 3e-8]
     return "pupil", poppy.ZernikeWFE(
         name="aberrations", radius=3.3 * u.m, coefficients=coefficients
     )
 
 
-def stop() -> Plane:
+def stop():
     return "pupil", poppy.SecondaryObscuration(
         name="stop", secondary_radius=0.7, n_supports=3, support_width=0.2, rotation=10, shift_x=0.1
     )
 
 
-def spot() -> Plane:
+def spot():
     return "image", poppy.CircularOcculter(name="spot", radius=0.3, shift_x=0.05, shift_y=-0.08)
 
 
-def bar() -> Plane:
+def bar():
     return "image", poppy.BarOcculter(name="bar", width=0.2 * u.arcsec, height=2 * u.arcsec)
 
 
-def band_limited(kind: str = "circular") -> Plane:
+def band_limited(kind="circular"):
     return "image", poppy.BandLimitedCoron(name=f"{kind} mask", kind=kind, sigma=5.0)
 
 
-def phase_spot() -> Plane:
+def phase_spot():
     return "image", poppy.optics.CircularPhaseMask(
         name="phase spot", radius=0.45 * u.arcsec, wavelength=4.2e-6 * u.m
     )
 
 
-def field_stop() -> Plane:
+def field_stop():
     return "image", poppy.optics.RectangularFieldStop(
         name="field stop", width=1 * u.arcsec, height=0.6 * u.arcsec, rotation=13
     )
 
 
-def fits_optic(**turns: Any) -> Plane:
+def fits_optic(**turns):
     """A FITS pupil, somewhat smaller than the array, with an OPD in microns."""
     y, x = np.mgrid[:80, :80] - 39.5
     amplitude = ((np.hypot(x, y) < 36) & ~((x > 5) & (y > 12))).astype(float)
@@ -112,7 +106,7 @@ def fits_optic(**turns: Any) -> Plane:
     )
 
 
-def image_array() -> Plane:
+def image_array():
     """An image-plane mask from an array, on samples of another size than the FFT's."""
     y, x = np.mgrid[:140, :140] - 69.5
     mask = 1 - np.exp(-((x - 3) ** 2 + (y + 6) ** 2) / 60)
@@ -124,11 +118,11 @@ def image_array() -> Plane:
     )
 
 
-def aligner(direction: str) -> Plane:
+def aligner(direction):
     return "pupil", poppy.FQPM_FFT_aligner(name=f"{direction} aligner", direction=direction)
 
 
-def quadrants() -> Plane:
+def quadrants():
     return "image", poppy.IdealFQPM(name="quadrants", wavelength=4.3e-6 * u.m)
 
 
@@ -184,13 +178,13 @@ OTHERS = {
 }  # fmt: skip
 
 
-def relative(image: Array, truth: Array) -> float:
+def relative(image, truth):
     return float(np.linalg.norm(image - truth) / np.linalg.norm(truth))
 
 
 @pytest.mark.parametrize("propagation", ["compact", "fft"])
 @pytest.mark.parametrize("planes", COMPACT.values(), ids=COMPACT)
-def test_bounded_masks_either_way(planes: tuple[Plane, ...], propagation: str) -> None:
+def test_bounded_masks_either_way(planes, propagation):
     system = make(*planes)
     truth = system.calc_psf(WAVELENGTH)[0].data
     model = from_poppy(system, WAVELENGTH, propagation=propagation)
@@ -200,14 +194,14 @@ def test_bounded_masks_either_way(planes: tuple[Plane, ...], propagation: str) -
 
 
 @pytest.mark.parametrize("planes", OTHERS.values(), ids=OTHERS)
-def test_everything_else(planes: tuple[Plane, ...]) -> None:
+def test_everything_else(planes):
     system = make(*planes)
     truth = system.calc_psf(WAVELENGTH)[0].data
     model = from_poppy(system, WAVELENGTH)
     assert relative(model.calc_psf()[0].data, truth) < 1e-12
 
 
-def compared(seeds: range) -> int:
+def compared(seeds):
     """Compare random systems with poppy; return how many were converted and not refused."""
     converted, refusals = 0, []
     for seed in seeds:
@@ -228,22 +222,22 @@ def compared(seeds: range) -> int:
     return converted
 
 
-def test_random_systems() -> None:
+def test_random_systems():
     assert compared(range(12)) >= 8
 
 
 @pytest.mark.slow
-def test_many_random_systems() -> None:
+def test_many_random_systems():
     assert compared(range(100, 220)) >= 85
 
 
-def test_the_image_is_the_binned_psf() -> None:
+def test_the_image_is_the_binned_psf():
     system = make(pupil(), spot(), stop())
     truth = system.calc_psf(WAVELENGTH)[0].data.reshape(40, 2, 40, 2).sum(axis=(1, 3))
     assert relative(from_poppy(system, WAVELENGTH)().numpy(), truth) < 1e-12
 
 
-def test_several_wavelengths_with_weights() -> None:
+def test_several_wavelengths_with_weights():
     system = make(pupil(), zernikes(), spot(), stop())
     waves, weights = [4e-6, 4.4e-6, 5e-6] * u.m, [1.0, 2.0, 3.0]
     truth = system.calc_psf(waves, weight=weights)
@@ -255,7 +249,7 @@ def test_several_wavelengths_with_weights() -> None:
 
 
 @pytest.mark.parametrize("normalize", ["first", "last", "exit_pupil"])
-def test_normalisations(normalize: str) -> None:
+def test_normalisations(normalize):
     # A stop that ends inside the array: poppy's exit pupil is the padded one.
     system = make(pupil(), spot(), ("pupil", poppy.CircularAperture(radius=2.6 * u.m)))
     truth = system.calc_psf(WAVELENGTH, normalize=normalize)[0]
@@ -264,14 +258,14 @@ def test_normalisations(normalize: str) -> None:
     assert psf.header["NORMALIZ"] == normalize
 
 
-def test_a_detector_beside_the_axis_and_not_square() -> None:
+def test_a_detector_beside_the_axis_and_not_square():
     detector = {"pixelscale": 0.05, "fov_pixels": (40, 30), "oversample": 2, "offset": (1.5, -3)}
     system = make(pupil(), zernikes(), detector=detector)
     truth = system.calc_psf(WAVELENGTH)[0].data
     assert relative(from_poppy(system, WAVELENGTH).calc_psf()[0].data, truth) < 1e-12
 
 
-def test_every_keyword_of_poppy_is_there() -> None:
+def test_every_keyword_of_poppy_is_there():
     system = make(pupil(), spot(), stop())
     truth = system.calc_psf(WAVELENGTH)[0].header
     header = from_poppy(system, WAVELENGTH).calc_psf()[0].header
@@ -283,7 +277,7 @@ def test_every_keyword_of_poppy_is_there() -> None:
     assert header["DRVERS"]
 
 
-def test_intermediate_wavefronts_are_those_of_poppy() -> None:
+def test_intermediate_wavefronts_are_those_of_poppy():
     system = make(pupil(), ("rotate", 90), ("invert", "x"), zernikes(), bar(), stop(), zernikes())
     _, theirs = system.calc_psf(WAVELENGTH, return_intermediates=True)
     model = from_poppy(system, WAVELENGTH, propagation="fft")
@@ -311,17 +305,7 @@ def test_intermediate_wavefronts_are_those_of_poppy() -> None:
     assert relative(last.intensity, theirs[-1].intensity) < 1e-12
 
 
-def test_planes_keep_names_and_order() -> None:
-    system = make(pupil(), ("invert", "y"), zernikes(), spot(), stop())
-    model = from_poppy(system, WAVELENGTH)
-    names = [p.name for p in (model.entrance, *model.planes, model.detector)]
-    assert names == [p.name for p in system.planes]
-    assert model.plane("spot").name == "spot"
-    with pytest.raises(KeyError, match="not a plane of this system"):
-        model.plane("spott")
-
-
-def test_later_changes_to_the_users_object_do_not_reach_the_model() -> None:
+def test_later_changes_to_the_users_object_do_not_reach_the_model():
     system = make(pupil(), zernikes(), spot(), stop())
     before = copy.deepcopy(system)
     model = from_poppy(system, WAVELENGTH)
@@ -333,7 +317,7 @@ def test_later_changes_to_the_users_object_do_not_reach_the_model() -> None:
     assert relative(image.numpy(), from_poppy(before, WAVELENGTH)().numpy()) == 0
 
 
-def test_star_offsets_add_to_the_systems_own_in_the_final_frame() -> None:
+def test_star_offsets_add_to_the_systems_own_in_the_final_frame():
     system = make(pupil(), ("invert", "x"), ("rotate", 20), spot(), stop())
     model = from_poppy(system, WAVELENGTH)
     x, y = 0.11, -0.07
@@ -348,7 +332,7 @@ def test_star_offsets_add_to_the_systems_own_in_the_final_frame() -> None:
 
 
 @pytest.mark.parametrize("inversion", ["x", "y"])
-def test_there_and_back(inversion: str) -> None:
+def test_there_and_back(inversion):
     """An OPD fitted here gives the same image in poppy."""
     system = make(pupil(), ("invert", inversion), zernikes(), spot(), stop())
     model = from_poppy(system, WAVELENGTH)
@@ -365,7 +349,7 @@ def test_there_and_back(inversion: str) -> None:
         opd_to_poppy(opd[:-1], system)
 
 
-def slope(function: Callable[[torch.Tensor], torch.Tensor], at: torch.Tensor, step: float) -> None:
+def slope(function, at, step):
     """Directional derivative by autograd against finite differences of fourth order."""
     direction = torch.randn(at.shape, generator=torch.manual_seed(1), dtype=at.dtype)
     variable = at.clone().requires_grad_()
@@ -377,7 +361,7 @@ def slope(function: Callable[[torch.Tensor], torch.Tensor], at: torch.Tensor, st
 
 
 @pytest.mark.parametrize("propagation", ["compact", "fft"])
-def test_gradients_with_respect_to_the_opd(propagation: str) -> None:
+def test_gradients_with_respect_to_the_opd(propagation):
     system = make(pupil(), ("rotate", 15), zernikes(), spot(), stop())
     model = from_poppy(system, WAVELENGTH, propagation=propagation)
     weight = torch.randn(40, 40, generator=torch.manual_seed(2), dtype=torch.float64)
@@ -385,7 +369,7 @@ def test_gradients_with_respect_to_the_opd(propagation: str) -> None:
     slope(lambda v: (model(v) * weight).sum(), opd, 1e-10)
 
 
-def test_planes_become_trainable_on_request() -> None:
+def test_planes_become_trainable_on_request():
     system = make(pupil(), ("invert", "y"), zernikes(), spot(), stop())
     model = from_poppy(system, WAVELENGTH, trainable=("aberrations",))
     opd, transmission = model.trainable["aberrations"]
@@ -393,7 +377,6 @@ def test_planes_become_trainable_on_request() -> None:
     truth = from_poppy(system, WAVELENGTH)()
     assert relative(model().detach().numpy(), truth.numpy()) < 1e-14
     model().square().sum().backward()
-    assert opd.grad is not None
     assert opd.grad.abs().max() > 0
     assert transmission.grad is not None
     # The tensors have the frame of their own plane: poppy agrees on a change of it.
@@ -412,7 +395,7 @@ def test_planes_become_trainable_on_request() -> None:
     assert relative(model().detach().numpy(), truth_changed.numpy()) < 1e-12
 
 
-def test_single_precision() -> None:
+def test_single_precision():
     system = make(pupil(), spot(), stop())
     truth = from_poppy(system, WAVELENGTH)().numpy()
     for propagation in ("compact", "fft"):
@@ -421,39 +404,39 @@ def test_single_precision() -> None:
         assert relative(single().numpy(), truth) < 1e-4
 
 
-def fresnel() -> Any:
+def fresnel():
     system = poppy.FresnelOpticalSystem(pupil_diameter=2 * u.m, npix=64)
     system.add_optic(poppy.CircularAperture(radius=1 * u.m))
     return system
 
 
-def without_detector() -> Any:
+def without_detector():
     system = make(pupil())
     del system.planes[-1]
     return system
 
 
-def starting_in_an_image() -> Any:
+def starting_in_an_image():
     system = make(pupil(), spot())
     del system.planes[0]
     return system
 
 
-def with_unknown_plane() -> Any:
+def with_unknown_plane():
     system = make(pupil(), zernikes())
     system.planes[1].planetype = PlaneType.intermediate
     return system
 
 
-def matrix_fourier() -> Any:
+def matrix_fourier():
     return poppy.MatrixFTCoronagraph(make(pupil(), spot(), stop()))
 
 
-def semi_analytic() -> Any:
+def semi_analytic():
     return poppy.SemiAnalyticCoronagraph(make(pupil(), spot(), stop()), fpm_index=1)
 
 
-def with_a_mask_on_its_own_samples() -> Any:
+def with_a_mask_on_its_own_samples():
     system = make(pupil(), spot(), stop())
     system.planes[1].propagation_hint = "MFT"
     return system
@@ -474,12 +457,12 @@ def with_a_mask_on_its_own_samples() -> Any:
         (lambda: make(pupil(), spot(), ("invert", "y"), stop()), "moves it by one sample"),
     ],
 )
-def test_what_is_not_supported_is_named(bad: Callable[[], Any], complaint: str) -> None:
+def test_what_is_not_supported_is_named(bad, complaint):
     with pytest.raises(IncompatibleSetupError, match=complaint):
         from_poppy(bad(), WAVELENGTH)
 
 
-def test_a_mask_without_bounds_cannot_be_forced() -> None:
+def test_a_mask_without_bounds_cannot_be_forced():
     system = make(pupil(), band_limited(), stop())
     with pytest.raises(IncompatibleSetupError, match=r"'circular mask'.*Use propagation='fft'"):
         from_poppy(system, WAVELENGTH, propagation="compact")
@@ -491,7 +474,7 @@ def test_a_mask_without_bounds_cannot_be_forced() -> None:
         from_poppy(system, WAVELENGTH).calc_psf(save_intermediates=True)
 
 
-def test_a_users_own_mask_says_how_far_it_reaches() -> None:
+def test_a_users_own_mask_says_how_far_it_reaches():
     system = make(pupil(), stop())
     mask = reference.SombreroOcculter(name="own")
     mask.occulter_box = 2.2

@@ -7,16 +7,13 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from astropy import units as u
 from astropy.io import fits
-from numpy.typing import NDArray
 from stpsf_data import lopsided, lyot_stop, pupil, zernike_tensor
 
 from pyklip_diffrender.bridges import from_webbpsf, opd_to_webbpsf
@@ -34,28 +31,16 @@ from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, zernike_basi
 from pyklip_diffrender.optics.planes import EntrancePupil
 from pyklip_diffrender.optics.system import OpticalSystem
 
-Array = NDArray[np.float64]
-
 NPIX = 256
-FAST = {
-    "monochromatic": 4.5e-6,
-    "fft_oversample": 2,
-    "detector_oversample": 1,
-    "fov_pixels": 60,
-}
+FAST = {"monochromatic": 4.5e-6, "fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 60}
 
 
 @pytest.fixture
-def nircam(stpsf_path: Path) -> Callable[..., Any]:
+def nircam(stpsf_path):
     """Make a configured stpsf.NIRCam."""
     import stpsf
 
-    def make(
-        image_mask: str | None = "MASK335R",
-        pupil_mask: str | None = "MASKRND",
-        band: str = "F444W",
-        **options: Any,
-    ) -> Any:
+    def make(image_mask="MASK335R", pupil_mask="MASKRND", band="F444W", **options):
         instrument = stpsf.NIRCam()
         instrument.filter = band
         instrument.image_mask, instrument.pupil_mask = image_mask, pupil_mask
@@ -66,23 +51,21 @@ def nircam(stpsf_path: Path) -> Callable[..., Any]:
     return make
 
 
-def error(image: Any, truth: Any) -> float:
+def error(image, truth):
     image, truth = np.asarray(image), np.asarray(truth)
     return float(np.abs(image - truth).max() / truth.max())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("flipped", [True, False])
-def test_the_flip_of_the_internal_wavefront_is_recorded_and_can_be_chosen(
-    nircam: Callable[..., Any], flipped: bool
-) -> None:
+def test_the_flip_of_the_internal_wavefront_is_recorded_and_can_be_chosen(nircam, flipped):
     instrument = nircam()
     kind = instrument._si_wfe_class
 
-    class AsBefore220(kind):  # type: ignore[misc, valid-type]
+    class AsBefore220(kind):
         """The aberrations without the flip that stpsf 2.2.0 brought."""
 
-        def __init__(self, owner: Any) -> None:
+        def __init__(self, owner):
             super().__init__(owner)
             if not flipped:
                 self.opd = self.opd[::-1]
@@ -100,7 +83,7 @@ def test_the_flip_of_the_internal_wavefront_is_recorded_and_can_be_chosen(
 
 
 @pytest.mark.slow
-def test_keywords_and_extensions_are_those_of_stpsf(nircam: Callable[..., Any]) -> None:
+def test_keywords_and_extensions_are_those_of_stpsf(nircam):
     instrument = nircam(source_offset_r=0.1, source_offset_theta=20.0)
     truth = instrument.calc_psf(**FAST)
     psf = from_webbpsf(instrument, **FAST).calc_psf()
@@ -115,7 +98,7 @@ def test_keywords_and_extensions_are_those_of_stpsf(nircam: Callable[..., Any]) 
 
 
 @pytest.mark.slow
-def test_a_script_for_stpsf_runs_unchanged(nircam: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_script_for_stpsf_runs_unchanged(nircam, tmp_path):
     instrument = nircam()
     model = from_webbpsf(instrument)
     path = str(tmp_path / "psf.fits")
@@ -141,9 +124,7 @@ def test_a_script_for_stpsf_runs_unchanged(nircam: Callable[..., Any], tmp_path:
         model.calc_psf(oversample=2, fft_oversample=2, detector_oversample=2)
 
 
-def test_the_users_object_and_the_model_do_not_touch_each_other(
-    nircam: Callable[..., Any],
-) -> None:
+def test_the_users_object_and_the_model_do_not_touch_each_other(nircam):
     instrument = nircam(source_offset_x=0.05)
     settings = copy.deepcopy(instrument.options)
     model = from_webbpsf(instrument, **FAST)
@@ -157,7 +138,7 @@ def test_the_users_object_and_the_model_do_not_touch_each_other(
 
 
 @pytest.mark.slow
-def test_a_refined_wavefront_goes_back(nircam: Callable[..., Any]) -> None:
+def test_a_refined_wavefront_goes_back(nircam):
     instrument = nircam()
     model = from_webbpsf(instrument, add_distortion=True, **FAST)
     opd = lopsided(NPIX, 99, 50e-9) * pupil(NPIX)
@@ -174,7 +155,7 @@ def test_a_refined_wavefront_goes_back(nircam: Callable[..., Any]) -> None:
     assert error(model(opd), instrument.calc_psf(**FAST)["DET_DIST"].data) > 1e-4
 
 
-def test_the_lyot_stop_moves_as_in_stpsf_by_whole_samples(nircam: Callable[..., Any]) -> None:
+def test_the_lyot_stop_moves_as_in_stpsf_by_whole_samples(nircam):
     """stpsf shifts in the exit pupil, where y is inverted, by whole samples."""
     shift = 5 / NPIX
     truth = nircam(pupil_shift_x=shift * 1.001, pupil_shift_y=-2 * shift * 1.001).calc_psf(**FAST)
@@ -188,7 +169,7 @@ def test_the_lyot_stop_moves_as_in_stpsf_by_whole_samples(nircam: Callable[..., 
     assert right < 0.005 < 0.1 < wrong
 
 
-def test_zernikes_add_to_the_internal_wavefront(nircam: Callable[..., Any]) -> None:
+def test_zernikes_add_to_the_internal_wavefront(nircam):
     instrument = nircam()
     coefficients = zernike_tensor(3)
     grid = PupilGrid.full(NPIX)
@@ -196,10 +177,10 @@ def test_zernikes_add_to_the_internal_wavefront(nircam: Callable[..., Any]) -> N
     extra = torch.tensordot(coefficients, basis, dims=1).numpy()[::-1]
     kind = instrument._si_wfe_class
 
-    class Changed(kind):  # type: ignore[misc, valid-type]
+    class Changed(kind):
         """The aberrations with some more of them."""
 
-        def __init__(self, owner: Any) -> None:
+        def __init__(self, owner):
             super().__init__(owner)
             self.opd = self.opd + extra
 
@@ -214,16 +195,14 @@ def test_zernikes_add_to_the_internal_wavefront(nircam: Callable[..., Any]) -> N
     [
         ("star_offset", [0.013, -0.021], 1e-4),
         ("lyot_shift", [0.0031, -0.0052], 1e-6),
-        ("lyot_rotation", [0.31], 1e-4),
+        pytest.param("lyot_rotation", [0.31], 1e-4, marks=pytest.mark.slow),
         ("si_zernikes", None, 1e-10),
-        ("detector_shift", [0.011, 0.023], 1e-4),
-        ("blur", [0.02], 1e-4),
+        pytest.param("detector_shift", [0.011, 0.023], 1e-4, marks=pytest.mark.slow),
+        pytest.param("blur", [0.02], 1e-4, marks=pytest.mark.slow),
         ("opd", None, 1e-10),
     ],
 )
-def test_gradients(
-    nircam: Callable[..., Any], name: str, value: list[float] | None, step: float
-) -> None:
+def test_gradients(nircam, name, value, step):
     """Through the whole chain to DET_DIST, against finite differences of fourth order."""
     model = from_webbpsf(nircam(), add_distortion=True, **{**FAST, "fov_pixels": 30})
     at = (
@@ -233,7 +212,7 @@ def test_gradients(
     weight = torch.randn(30, 30, generator=generator, dtype=torch.float64)
     direction = torch.randn(at.shape, generator=generator, dtype=torch.float64)
 
-    def function(v: torch.Tensor) -> torch.Tensor:
+    def function(v):
         return (model(**{name: v}) * weight).sum()
 
     variable = at.clone().requires_grad_()
@@ -247,9 +226,7 @@ def test_gradients(
 @pytest.mark.parametrize(
     "offset", [(0.31, -0.12), pytest.param((-0.04, 0.52), marks=pytest.mark.slow)]
 )
-def test_star_offsets_are_source_offsets(
-    nircam: Callable[..., Any], offset: tuple[float, float]
-) -> None:
+def test_star_offsets_are_source_offsets(nircam, offset):
     x, y = offset
     truth = nircam(source_offset_x=x, source_offset_y=y).calc_psf(**FAST)[1].data
     assert error(from_webbpsf(nircam(), **FAST)(star_offset=offset), truth) < 1e-10
@@ -259,9 +236,7 @@ def test_star_offsets_are_source_offsets(
     assert error(half(star_offset=(x / 2, y / 2)), truth) < 1e-10
 
 
-def test_the_embedded_coronagraph_has_the_orientation_of_stpsf(
-    nircam: Callable[..., Any],
-) -> None:
+def test_the_embedded_coronagraph_has_the_orientation_of_stpsf(nircam):
     """Core planes around stpsf's arrays: internal aberration, wedge tilt, offset and all.
 
     The Zernikes differ by a thousandth: poppy puts the circle through the outermost samples. The
@@ -271,7 +246,7 @@ def test_the_embedded_coronagraph_has_the_orientation_of_stpsf(
     truth = instrument.calc_psf(**FAST)[1].data
     coefficients = instrument._get_aberrations().zernike_coeffs
 
-    def embedded(flip: bool = True, offset: tuple[float, float] = (0.31, -0.12)) -> torch.Tensor:
+    def embedded(flip=True, offset=(0.31, -0.12)):
         base = nircam_coronagraph(
             monochromatic=4.5e-6,
             npix=NPIX,
@@ -301,21 +276,12 @@ def test_the_embedded_coronagraph_has_the_orientation_of_stpsf(
     assert error(embedded(offset=(0.31, 0.12)), truth) > 0.1
 
 
-def test_batches_of_wavefronts_and_stars(nircam: Callable[..., Any]) -> None:
-    model = from_webbpsf(nircam(), add_distortion=True, **FAST)
-    opds = torch.from_numpy(np.stack([lopsided(NPIX, k, 5e-8) for k in (1, 2)]))
-    stars = torch.tensor([[0.1, 0.0], [0.0, -0.2]])
-    both = model(opds, star_offset=stars)
-    for k in (0, 1):
-        assert error(both[k], model(opds[k], star_offset=stars[k])) < 1e-12
-
-
-def test_another_instrument_is_refused(stpsf_path: Path) -> None:
+def test_another_instrument_is_refused(stpsf_path):
     with pytest.raises(IncompatibleSetupError, match=r"expected an stpsf\.NIRCam"):
         from_webbpsf("NIRCam")
 
 
-def test_wavelengths_that_do_not_fit(nircam: Callable[..., Any]) -> None:
+def test_wavelengths_that_do_not_fit(nircam):
     with pytest.raises(IncompatibleSetupError, match="too short for NIRCam long wave"):
         from_webbpsf(nircam(), monochromatic=2e-6)
     with pytest.warns(DiffrenderWarning, match=r"3\.5e-06 m is outside F444W"):
@@ -329,12 +295,7 @@ def test_wavelengths_that_do_not_fit(nircam: Callable[..., Any]) -> None:
         (lambda opd: np.where(pupil(NPIX) > 0, np.nan, opd), NonFiniteError, "NaN"),
     ],
 )
-def test_maps_that_cannot_be_right(
-    nircam: Callable[..., Any],
-    change: Callable[[Array], Array],
-    expected: type[Exception],
-    complaint: str,
-) -> None:
+def test_maps_that_cannot_be_right(nircam, change, expected, complaint):
     instrument = nircam()
     opd = change(lopsided(NPIX, 7, 60e-9) * pupil(NPIX))
     header = fits.Header({"BUNIT": "m", "PUPLSCAL": JWST_DIAMETER / NPIX})
@@ -345,16 +306,7 @@ def test_maps_that_cannot_be_right(
         opd_to_webbpsf(opd, nircam())
 
 
-def test_a_map_upside_down_is_noticed(nircam: Callable[..., Any]) -> None:
-    instrument = nircam()
-    opd = (lopsided(NPIX, 8, 60e-9) * pupil(NPIX))[::-1]
-    header = fits.Header({"BUNIT": "m", "PUPLSCAL": JWST_DIAMETER / NPIX})
-    instrument.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
-    with pytest.warns(DiffrenderWarning, match="match the pupil upside down"):
-        from_webbpsf(instrument, **FAST)
-
-
-def test_a_map_of_another_size_is_resampled(nircam: Callable[..., Any]) -> None:
+def test_a_map_of_another_size_is_resampled(nircam):
     opd = lopsided(NPIX, 99, 50e-9)
     fine = np.kron(opd, np.ones((4, 4)))
     taken, wanted = (opd_to_webbpsf(each, nircam())[0].data for each in (fine, opd))
@@ -364,7 +316,7 @@ def test_a_map_of_another_size_is_resampled(nircam: Callable[..., Any]) -> None:
 
 
 @pytest.fixture
-def incomplete(stpsf_path: Path, tmp_path: Path) -> Iterator[Path]:
+def incomplete(stpsf_path, tmp_path):
     """A copy of the data directory to take files from."""
     folder = tmp_path / "incomplete"
     shutil.copytree(stpsf_path, folder)
@@ -382,9 +334,7 @@ def incomplete(stpsf_path: Path, tmp_path: Path) -> Iterator[Path]:
         "NIRCam/IPC/KERNEL_IPC_CUBE.fits",
     ],
 )
-def test_a_missing_file_is_named_with_the_directory(
-    nircam: Callable[..., Any], incomplete: Path, missing: str
-) -> None:
+def test_a_missing_file_is_named_with_the_directory(nircam, incomplete, missing):
     instrument = nircam()
     instrument._datapath = str(incomplete / "NIRCam")
     instrument._STPSF_basepath = str(incomplete)
@@ -394,13 +344,13 @@ def test_a_missing_file_is_named_with_the_directory(
     assert Path(missing).name in str(caught.value)
 
 
-def test_unknown_jitter_is_refused(nircam: Callable[..., Any]) -> None:
+def test_unknown_jitter_is_refused(nircam):
     with pytest.raises(IncompatibleSetupError, match="'linear' is not supported"):
         from_webbpsf(nircam(jitter="linear"), **FAST)
 
 
 @pytest.mark.slow
-def test_the_older_name_works_as_well(stpsf_path: Path) -> None:
+def test_the_older_name_works_as_well(stpsf_path):
     """webbpsf 2 is stpsf under another name and takes its path from WEBBPSF_PATH."""
     code = f"""
 import webbpsf

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,12 +12,7 @@ from astropy.table import Table
 from astropy.time import Time
 from stpsf_data import pupil, wss_file
 
-from pyklip_diffrender.bridges import (
-    from_webbpsf,
-    load_wss_opd,
-    load_wss_opd_by_date,
-    opd_to_hdus,
-)
+from pyklip_diffrender.bridges import from_webbpsf, load_wss_opd, load_wss_opd_by_date, opd_to_hdus
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -34,13 +28,13 @@ NPIX = 256
 
 
 @pytest.fixture
-def wss(tmp_path: Path) -> Path:
+def wss(tmp_path):
     path = tmp_path / "R2022081102-NRCA3_FP1-1.fits"
     wss_file(path)
     return path
 
 
-def test_it_is_the_map_that_stpsf_loads(stpsf_path: Path, wss: Path) -> None:
+def test_it_is_the_map_that_stpsf_loads(stpsf_path, wss):
     import stpsf
 
     instrument = stpsf.NIRCam()
@@ -70,7 +64,7 @@ def test_it_is_the_map_that_stpsf_loads(stpsf_path: Path, wss: Path) -> None:
     assert "subtracted SI WFE" in str(header["HISTORY"])
 
 
-def test_finer_maps_are_placed_as_stpsf_places_them(stpsf_path: Path, wss: Path) -> None:
+def test_finer_maps_are_placed_as_stpsf_places_them(stpsf_path, wss):
     from stpsf import mast_wss
 
     hdus = mast_wss.import_wss_opd(str(wss), npix_out=1024)
@@ -81,7 +75,7 @@ def test_finer_maps_are_placed_as_stpsf_places_them(stpsf_path: Path, wss: Path)
     hdus.close()
 
 
-def test_without_stpsf_data_the_sum_can_be_read(wss: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_stpsf_data_the_sum_can_be_read(wss, monkeypatch):
     monkeypatch.delenv("STPSF_PATH", raising=False)
     loaded = load_wss_opd(wss, npix=NPIX, backout_si_wfe=False)
     assert 4e-8 < loaded.data[loaded.data != 0].std() < 1e-7
@@ -94,9 +88,7 @@ def test_without_stpsf_data_the_sum_can_be_read(wss: Path, monkeypatch: pytest.M
     assert kept.history[-1].startswith("kept SI WFE")
 
 
-def test_read_opd_recognises_the_file_by_its_content(
-    stpsf_path: Path, wss: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_read_opd_recognises_the_file_by_its_content(stpsf_path, wss, tmp_path, monkeypatch):
     renamed = tmp_path / "map.fits"
     renamed.write_bytes(wss.read_bytes())
     with fits.open(wss) as hdus:
@@ -122,7 +114,7 @@ def test_read_opd_recognises_the_file_by_its_content(
         read_opd(tmp_path / "empty.fits")
 
 
-def test_interpolation_in_time_warns(wss: Path, tmp_path: Path) -> None:
+def test_interpolation_in_time_warns(wss, tmp_path):
     later = tmp_path / "R2022081402-NRCA3_FP1-1.fits"
     wss_file(later, seed=6, date="2022-08-14T02:00:00")
     maps = [load_wss_opd(path, npix=NPIX, backout_si_wfe=False) for path in (wss, later)]
@@ -146,7 +138,7 @@ ROWS = [
 ]
 
 
-@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("backwards", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("date", "choice", "names"),
     [
@@ -160,19 +152,11 @@ ROWS = [
         ("2022-08-13T08:00", "interpolate", [SECOND, "R2022081402-NRCA3_FP1-1.fits"]),
     ],
 )
-def test_by_date_through_stpsf(
-    wss: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    date: str,
-    choice: str,
-    names: list[str],
-    backwards: bool,
-) -> None:
+def test_by_date_through_stpsf(wss, tmp_path, monkeypatch, date, choice, names, backwards):
     """What stpsf leaves out of its tables is not used, and of one sensing the last analysis."""
     from stpsf import mast_wss
 
-    def listed(when: Time, days: u.Quantity) -> Table:
+    def listed(when, days):
         rows = [
             (Time(moment).mjd, *facts)
             for moment, *facts in ROWS
@@ -183,7 +167,7 @@ def test_by_date_through_stpsf(
 
     fetched = []
 
-    def fetch(name: str, output_path: str | None) -> str:
+    def fetch(name, output_path):
         assert output_path is None
         fetched.append(name)
         path = tmp_path / name
@@ -201,10 +185,10 @@ def test_by_date_through_stpsf(
         load_wss_opd_by_date("2022-08-01", "before")
 
 
-def test_an_archive_that_cannot_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_archive_that_cannot_be_asked(monkeypatch):
     from stpsf import mast_wss
 
-    def unreachable(when: Time, days: u.Quantity) -> Table:
+    def unreachable(when, days):
         raise ConnectionError("no route to host")
 
     monkeypatch.setattr(mast_wss, "mast_wss_date_query", unreachable)
@@ -214,7 +198,7 @@ def test_an_archive_that_cannot_be_asked(monkeypatch: pytest.MonkeyPatch) -> Non
         load_wss_opd_by_date("2022-08-11T08:00:00", "latest")
 
 
-def test_files_that_are_something_else(wss: Path, tmp_path: Path) -> None:
+def test_files_that_are_something_else(wss, tmp_path):
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.zeros((4, 4))).writeto(path)
     with pytest.raises(CorruptFileError, match="no extension RESULT_PHASE"):
@@ -251,7 +235,7 @@ def test_files_that_are_something_else(wss: Path, tmp_path: Path) -> None:
     assert loaded.date == Time("2023-01-02")
 
 
-def test_the_sensing_camera_must_be_known(stpsf_path: Path, wss: Path, tmp_path: Path) -> None:
+def test_the_sensing_camera_must_be_known(stpsf_path, wss, tmp_path):
     with fits.open(wss) as hdus:
         del hdus[0].header["APERNAME"]
         hdus.writeto(tmp_path / "nameless.fits")

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ PAIRS = (("G 7-34", "F444W"), ("G 7-34", "F356W"), ("HIP 17695", "F444W"), ("HIP
 
 
 @cache
-def table(name: str) -> Table:
+def table(name):
     found = Table.read(RESULTS / f"{name}.ecsv")
     for name, column in found.columns.items():
         if isinstance(column, MaskedColumn) and column.dtype.kind in "UO":
@@ -33,7 +33,7 @@ def table(name: str) -> Table:
     return found
 
 
-def rows(name: str, **where: Any) -> Table:
+def rows(name, **where):
     """Rows of a table with these values; there is at least one."""
     found = table(name)
     for column, value in where.items():
@@ -42,68 +42,68 @@ def rows(name: str, **where: Any) -> Table:
     return found
 
 
-def stated(quantity: str, column: str = "value", **where: Any) -> float:
+def stated(quantity, column="value", **where):
     """The one number of `stated_numbers.ecsv` with this name."""
     (row,) = rows("stated_numbers", quantity=quantity, **where)
     return float(row[column])
 
 
-def middle(name: str, column: str, **where: Any) -> float:
+def middle(name, column, **where):
     return float(np.median(rows(name, **where)[column]))
 
 
-def least(name: str, column: str, **where: Any) -> float:
+def least(name, column, **where):
     return float(np.min(rows(name, **where)[column]))
 
 
-def of_pairs(name: str, column: str) -> list[float]:
+def of_pairs(name, column):
     """Median and smallest value for each pair of rolls, one after the other."""
     return [
         f(name, column, star=star, filter=band) for star, band in PAIRS for f in (middle, least)
     ]
 
 
-def medians(name: str, column: str, star: str, *bands: str) -> list[float]:
+def medians(name, column, star, *bands):
     return [middle(name, column, star=star, filter=band) for band in bands]
 
 
-def planets(where: str, count: int) -> list[float]:
+def planets(where, count):
     """How many planets were detected, and of how many."""
     quantity = f"injected planets: detected {where} 0.45 arcsec, of {count}"
     found = rows("stated_numbers", quantity=quantity)
     return [float(np.sum(found["value"])), count * len(found)]
 
 
-def all_planets() -> list[float]:
+def all_planets():
     beyond, within = planets("beyond", 24), planets("within", 4)
     return [beyond[0] + within[0], beyond[1] + within[1]]
 
 
-def disk(setting: str, *bands: str) -> list[float]:
+def disk(setting, *bands):
     quantity = "disk's light that is kept"
     return [stated(quantity, filter=band, setting=setting) for band in bands]
 
 
-def of_klip(extreme: Callable[[Any], float]) -> float:
+def of_klip(extreme):
     """Least or most of the disk's light that KLIP keeps, in any filter and with any modes."""
     found = rows("stated_numbers", quantity="disk's light that is kept")
     return extreme([row["value"] for row in found if str(row["setting"]).startswith("KLIP")])
 
 
-def companion(quantity: str, scale: float = 1.0) -> list[float]:
+def companion(quantity, scale=1.0):
     """Value and error of HIP 65426 b, as measured in the fit of the page."""
     where = {"star": "HIP 65426", "setting": ""}
     return [scale * stated(quantity, column, **where) for column in ("value", "error")]
 
 
-def calibration(hours: float) -> list[float]:
+def calibration(hours):
     """Scatter of the S/N, the same for a known star, and the limit over that of a known star."""
     found = rows("calibration_measured", hours=hours)
     scatter = [float(np.sqrt(np.mean(found[each] ** 2))) for each in ("null", "known_star_null")]
     return [*scatter, float(np.mean(found["limit_mean"]))]
 
 
-def fluxes(at_limit: bool, contrast: float | None = None) -> list[float]:
+def fluxes(at_limit, contrast=None):
     """Weighted ratio to the truth and its error, mean pull and its error, deviation, light kept."""
     found = table("fluxes_measured")
     if at_limit or contrast is not None:
@@ -119,7 +119,7 @@ def fluxes(at_limit: bool, contrast: float | None = None) -> list[float]:
     return [mean, weight.sum() ** -0.5, float(np.mean(pull)), spread, float(np.std(pull)), kept]
 
 
-def experiments(method: str) -> list[float]:
+def experiments(method):
     """Medians of annulus SNR, of the S/N over that of a known star, and of the throughput."""
     found = rows("klip_table_measured")
     known = {
@@ -135,7 +135,7 @@ def experiments(method: str) -> list[float]:
     return [medians[0], float(np.median(ratio)), medians[1]]
 
 
-def speed(row: str, column: str, what: str) -> float:
+def speed(row, column, what):
     (found,) = (
         each for each in rows("performance", row=row, precision="float64")
         if str(each["column"]) == column
@@ -334,30 +334,21 @@ CLAIMS = (
 )  # fmt: skip
 
 
-def plain(text: str) -> str:
+def plain(text):
     """Text without line breaks."""
     return " ".join(text.split())
 
 
-def powers(text: str) -> str:
+def powers(text):
     """Exponents as people write them: 5e-7 for 5e-07."""
     return re.sub(r"e-0(\d)", r"e-\1", text)
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda each: f"{each.document}: {each.phrase[:40]}")
-def test_a_claim_is_what_the_table_says(claim: Claim) -> None:
+def test_a_claim_is_what_the_table_says(claim):
     text = plain((ROOT / claim.document).read_text(encoding="utf-8"))
     phrase = plain(powers(claim.phrase.format(*claim.numbers())))
     assert phrase in text, f"{claim.document} does not say: {phrase}"
-
-
-def test_a_wrong_number_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    changed = table("stated_numbers").copy()
-    changed["value"] *= 1.1
-    monkeypatch.setitem(globals(), "table", lambda name: changed)
-    claim = next(each for each in CLAIMS if "the only candidate" in each.phrase)
-    with pytest.raises(AssertionError, match="does not say"):
-        test_a_claim_is_what_the_table_says(claim)
 
 
 SETTINGS = (
@@ -373,7 +364,7 @@ SETTINGS = (
     ("document", "begin", "end"),
     [("README.md", "## Why", "## Install"), ("paper/paper.md", "# Validation", "# Acknowledg")],
 )
-def test_results_of_readme_and_paper_are_all_claims(document: str, begin: str, end: str) -> None:
+def test_results_of_readme_and_paper_are_all_claims(document, begin, end):
     """A number that is in no claim could disagree with the tables."""
     text = plain(
         (ROOT / document).read_text(encoding="utf-8").partition(begin)[2].partition(end)[0]
@@ -387,23 +378,12 @@ def test_results_of_readme_and_paper_are_all_claims(document: str, begin: str, e
     assert set(left) <= ALLOWED[document], f"{document}: {left} are in no claim"
 
 
-ALLOWED = {
-    "README.md": {"(F444W"},
-    "paper/paper.md": {"10", "@carter2023"},
-}
+ALLOWED = {"README.md": {"(F444W"}, "paper/paper.md": {"10", "@carter2023"}}
 """Words with digits that are left: settings, and errors that the text explains elsewhere."""
 
 
-def test_the_page_of_real_frames_has_few_numbers() -> None:
-    text = (ROOT / PAGE).read_text(encoding="utf-8")
-    for pattern in SETTINGS[:2]:
-        text = re.sub(pattern, "", text)
-    numbers = re.findall(r"(?<![\w.])\d[\d.]*(?:e-?\d+)?", text)
-    assert 60 < len(numbers) <= 120
-
-
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*.ecsv")), ids=lambda path: path.name)
-def test_tables_say_when_and_how_they_were_made(path: Path) -> None:
+def test_tables_say_when_and_how_they_were_made(path):
     found = Table.read(path)
     text = " ".join(map(str, found.meta.values()))
     for name in ("command", "date", "note"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from synthetic_searches import CURVATURE, PIXEL, noise, searched
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.cli.reducing import combined
-from pyklip_diffrender.detection import Detection, Motion, SkyMap, hypotheses
+from pyklip_diffrender.detection import Motion
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.sky_map import Family, SkyStack
 from pyklip_diffrender.detection.templates import weigh
@@ -31,7 +30,7 @@ MOTION = (0.3, -0.2)
 YEAR = 365.25
 
 
-def fitted(filter: str, wavelength: float, seed: int) -> Detection:
+def fitted(filter, wavelength, seed):
     """A small frame of a star, searched, with maps in double precision at its pixels."""
     model = dr.nircam_coronagraph(filter, monochromatic=wavelength, npix=64, fov_pixels=16)
     opd = dr.random_opd(1, npix=64)
@@ -43,11 +42,11 @@ def fitted(filter: str, wavelength: float, seed: int) -> Detection:
 
 
 @pytest.fixture(scope="module")
-def pair() -> list[Detection]:
+def pair():
     return [fitted("F444W", 4.4e-6, 1), fitted("F356W", 3.6e-6, 2)]
 
 
-def stacked(models: list[LinearModel]) -> LinearModel:
+def stacked(models):
     """One model of the data of several, whose unknowns are independent."""
     unknowns, frames, count = [], [], 0
     for model in models:
@@ -67,7 +66,7 @@ def stacked(models: list[LinearModel]) -> LinearModel:
     )  # fmt: skip
 
 
-def test_it_is_the_joint_likelihood_of_all_frames(pair: list[Detection]) -> None:
+def test_it_is_the_joint_likelihood_of_all_frames(pair):
     """Amplitudes of spectra equal those of one linear model of both data sets."""
     grid = pair[0].grid
     offsets = torch.from_numpy(grid.reshape(-1, 2))
@@ -112,9 +111,7 @@ def test_it_is_the_joint_likelihood_of_all_frames(pair: list[Detection]) -> None
     assert np.all(np.abs(measured - both_fluxes) < 1e-8 * np.array(errors))
 
 
-def test_a_combination_of_products_is_that_of_the_detections(
-    pair: list[Detection], tmp_path: Path
-) -> None:
+def test_a_combination_of_products_is_that_of_the_detections(pair, tmp_path):
     for each in pair:
         each.write(tmp_path / str(each.observation.filter))
     folders = [tmp_path / "F444W", tmp_path / "F356W"]
@@ -141,7 +138,7 @@ def test_a_combination_of_products_is_that_of_the_detections(
     assert "expected two or more" in combined(folders[:1], (), **options)
 
 
-def test_a_planet_too_faint_for_each_filter_is_a_candidate_of_both() -> None:
+def test_a_planet_too_faint_for_each_filter_is_a_candidate_of_both():
     place = (0.6, 0.35)
     one = searched("F444W", 1, [(*place, 4.2)], north=20.0)
     two = searched("F356W", 2, [(*place, 4.0)], north=-35.0)
@@ -163,7 +160,7 @@ def test_a_planet_too_faint_for_each_filter_is_a_candidate_of_both() -> None:
     assert both.thresholds["all filters, spectra"] > 5
 
 
-def test_the_colour_says_which_spectrum() -> None:
+def test_the_colour_says_which_spectrum():
     """A planet of 250 K has a tenth of its flux in F356W."""
     cold = searched("F444W", 1, [(0.6, 0.3, 30.0)], known=True)
     none = searched("F356W", 2, [(0.6, 0.3, 2.9)])
@@ -180,7 +177,7 @@ def test_the_colour_says_which_spectrum() -> None:
     assert len(warm.candidates) == 1
 
 
-def test_a_source_of_one_filter_alone_is_found_with_free_fluxes_and_keeps_its_flux() -> None:
+def test_a_source_of_one_filter_alone_is_found_with_free_fluxes_and_keeps_its_flux():
     """A methane planet, bright at 4.4 micron only, among spectra that have light in both."""
     one = searched("F444W", 1, [(0.6, 0.3, 12.0)], known=True)
     two = searched("F356W", 3, [(0.6, 0.3, -6.0)])
@@ -189,7 +186,7 @@ def test_a_source_of_one_filter_alone_is_found_with_free_fluxes_and_keeps_its_fl
     assert both.candidates["snr_F444W"][0] == pytest.approx(12, abs=0.05)
 
 
-def test_errors_that_are_hardly_known_need_a_higher_peak() -> None:
+def test_errors_that_are_hardly_known_need_a_higher_peak():
     sources = [(0.6, 0.35, 5.0)]
     known = dr.combine([searched("F444W", 1, sources), searched("F356W", 2, sources)])
     unsure = dr.combine(
@@ -200,25 +197,7 @@ def test_errors_that_are_hardly_known_need_a_higher_peak() -> None:
     np.testing.assert_allclose(known.snr, unsure.snr)
 
 
-def test_side_lobes_of_a_bright_candidate_are_no_candidates() -> None:
-    """What a search explains by its own candidates is not searched again."""
-    bright = searched("F444W", 1, [(0.6, 0.3, 300.0)], known=True)
-    lobe = searched("F444W", 1, [(0.6, 0.3, 300.0), (-0.5, -0.4, 8.0)], known=True)
-    snr = np.where(np.hypot(*np.moveaxis(lobe.grid, -1, 0)) < 9, lobe.snr, 0)
-    both = dr.combine([replace_maps(bright, snr), searched("F356W", 2)])
-    assert len(both.candidates) == 1
-    assert both.candidates["snr_F444W"][0] == pytest.approx(300, rel=1e-3)
-
-
-def replace_maps(detection: Detection, snr: np.ndarray) -> Detection:
-    """The detection with another map, whose residual stays as it is."""
-    changed = replace(detection, snr=snr)
-    for name in ("observation", "sky", "provenance"):
-        vars(changed)[name] = getattr(detection, name)
-    return changed
-
-
-def test_a_bad_fit_is_left_out_and_its_candidates_with_it() -> None:
+def test_a_bad_fit_is_left_out_and_its_candidates_with_it():
     bad = searched("F444W", 1, [(0.6, 0.3, 40.0)], status="MODEL_MISMATCH", known=True)
     good = [searched("F356W", 2), searched("F300M", 3)]
     both = dr.combine([bad, *good])
@@ -231,7 +210,7 @@ def test_a_bad_fit_is_left_out_and_its_candidates_with_it() -> None:
         dr.combine([bad, good[0]])
 
 
-def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path):
     one = searched("F444W", 1, header={"TARGPROP": "HD 1", "TARG_RA": 10.0, "TARG_DEC": 5.0})
     other = searched("F356W", 2, header={"TARGPROP": "HD 2", "TARG_RA": 90.0, "TARG_DEC": 5.0})
     with pytest.raises(IncompatibleSetupError, match="HD 1 and HD 2"):
@@ -251,7 +230,7 @@ def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path: Path) -> N
         dr.combine([searched("F444W"), searched("F356W")], spectra=str(short))
 
 
-def test_spectra_come_from_a_table_of_model_atmospheres(tmp_path: Path) -> None:
+def test_spectra_come_from_a_table_of_model_atmospheres(tmp_path):
     wave = np.linspace(2.5, 5.6, 200)
     table = QTable({
         "wavelength": wave * u.micron,
@@ -273,7 +252,7 @@ def test_spectra_come_from_a_table_of_model_atmospheres(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_free_fluxes_at_one_place_follow_chi_bar_squared(count: int) -> None:
+def test_free_fluxes_at_one_place_follow_chi_bar_squared(count):
     stack = SkyStack(
         np.zeros((count, 1)), np.zeros((count, 1)), np.ones((count, 1)), np.zeros((count, 2, 2))
     )
@@ -284,8 +263,10 @@ def test_free_fluxes_at_one_place_follow_chi_bar_squared(count: int) -> None:
         assert Family(None, stack, 1.0).expected(level) == pytest.approx(rare, rel=1e-9)
 
 
-@pytest.mark.parametrize("names", [("F444W", "F356W"), ("F444W", "F356W", "F210M")])
-def test_noise_has_as_many_peaks_as_expected(names: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "names", [("F444W", "F356W"), pytest.param(("F444W", "F356W", "F210M"), marks=pytest.mark.slow)]
+)
+def test_noise_has_as_many_peaks_as_expected(names):
     """Fine maps of noise: the share with a peak above a level, for black bodies and free fluxes."""
     count, side = 1000, 40
     errors = np.array([1.0, 0.6, 0.8])[: len(names), None]
@@ -309,13 +290,7 @@ def test_noise_has_as_many_peaks_as_expected(names: tuple[str, ...]) -> None:
             assert share - 3 * spread < expected < 1.5 * share + 4 * spread, (name, level, share)
 
 
-def test_the_curvature_of_a_map_is_measured() -> None:
-    turned = SkyMap.of(searched(side=121, seed=4, north=30.0), "map")
-    # Of 121 x 121 pixels, of which about 800 are independent.
-    np.testing.assert_allclose(turned.curvature, CURVATURE * np.eye(2), atol=0.1 * CURVATURE)
-
-
-def test_parallax_and_proper_motion_are_those_of_astropy() -> None:
+def test_parallax_and_proper_motion_are_those_of_astropy():
     star = SkyCoord(80.0 * u.deg, -30.0 * u.deg, distance=10 * u.pc)
     motion = Motion(MOTION, 0.1, (80.0, -30.0))
     before, after = 59900.0, 59990.0
@@ -330,8 +305,8 @@ def test_parallax_and_proper_motion_are_those_of_astropy() -> None:
     np.testing.assert_allclose(motion.background(before, after), expected, atol=5e-4)
 
 
-def epochs(first: tuple[float, float, float], second: tuple[float, float, float], seed: int = 0,
-           days: float = 400.0) -> list[Detection]:  # fmt: skip
+def epochs(first, second, seed = 0,
+           days = 400.0):  # fmt: skip
     """A source at two epochs."""
     return [
         searched("F444W", 2 * seed + 1, [first], mjd=59900.0),
@@ -339,7 +314,7 @@ def epochs(first: tuple[float, float, float], second: tuple[float, float, float]
     ]
 
 
-def test_epochs_tell_companions_from_the_background() -> None:
+def test_epochs_tell_companions_from_the_background():
     moved = -np.array(MOTION) * 400 / YEAR
     start = np.array([0.5, 0.45])
     bound = dr.combine(epochs((*start, 9.0), (*start, 9.0)), proper_motion=MOTION)
@@ -360,7 +335,7 @@ def test_epochs_tell_companions_from_the_background() -> None:
     assert still.candidates["probability_neither"][0] < 0.01
 
 
-def test_a_faint_companion_is_found_in_the_sum_of_epochs() -> None:
+def test_a_faint_companion_is_found_in_the_sum_of_epochs():
     start = (0.5, 0.45, 4.4)
     both = dr.combine(epochs(start, start, seed=3), proper_motion=MOTION)
     assert len(both.candidates) == 1
@@ -369,7 +344,7 @@ def test_a_faint_companion_is_found_in_the_sum_of_epochs() -> None:
     assert all(name.endswith("spectra") for name in both.thresholds)
 
 
-def test_orbits_allow_a_bound_source_to_move() -> None:
+def test_orbits_allow_a_bound_source_to_move():
     """At 0.7 arcsec and 10 pc a circular orbit moves by 0.24 arcsec a year."""
     start = np.array([0.5, 0.45])
     moved = start + np.array([0.12, -0.13])
@@ -381,32 +356,10 @@ def test_orbits_allow_a_bound_source_to_move() -> None:
     assert len(orbit.candidates) == 1
 
 
-def test_more_background_sources_are_told_apart_the_farther_the_star_moves() -> None:
-    """Of seeded sources of S/N 8, whose places are known to 0.011 arcsec."""
-    shares = []
-    for motion in (0.01, 0.05, 0.15):
-        told = 0
-        for seed in range(12):
-            start = np.array([0.5, 0.45])
-            end = start - [motion, 0.0]
-            maps = [SkyMap.of(each, str(k)) for k, each in
-                    enumerate(epochs((*start, 8.0), (*end, 8.0), seed, YEAR))]  # fmt: skip
-            flux = dict.fromkeys(("0", "1"), 1.0)
-            result = hypotheses(maps, flux, start, 59900.0, Motion((motion, 0.0)))
-            total = result.bound + result.background + result.neither
-            assert total == pytest.approx(1)
-            told += result.verdict.startswith("stays")
-            assert not result.verdict.startswith("moves")
-        shares.append(told / 12)
-    assert shares[0] <= shares[1] <= shares[2]
-    assert shares[0] < 0.2
-    assert shares[2] > 0.9
-
-
 @pytest.mark.slow
-def test_false_candidates_are_as_rare_as_those_of_a_single_search() -> None:
+def test_false_candidates_are_as_rare_as_those_of_a_single_search():
     """Thresholds lowered to 3.6, so that many searches of noise have a candidate."""
-    count, level = 150, 3.6
+    count, level = 80, 3.6
     false = single = 0
     for seed in range(count):
         maps = [searched("F444W", 3 * seed, north=10.0), searched("F356W", 3 * seed + 1)]

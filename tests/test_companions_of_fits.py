@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import pyklip_diffrender as dr
 from benchmarks.planets import searched
@@ -17,20 +15,14 @@ from pyklip_diffrender.detection.candidates import (
     lacks_candidates,
     unconfirmed_companions,
 )
-from pyklip_diffrender.detection.search import with_raised_peaks
-from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 
 FOUND = Candidates.at([[0.6, 0.3]], [3e-4])
 
 
-def fit(
-    *companions: tuple[float, float, float], turned: float = 0.0, reference: bool = False
-) -> Any:
+def fit(*companions, turned=0.0, reference=False):
     """A fit of lambda/D = 0.14 arcsec; its first frame is turned by so many degrees."""
     observation = SimpleNamespace(
-        reference=reference,
-        angle=turned,
-        roll_from=lambda other: turned - other.angle,
+        reference=reference, angle=turned, roll_from=lambda other: turned - other.angle
     )
     array = np.reshape(companions, (-1, 3)).astype(float)
     return SimpleNamespace(
@@ -54,28 +46,21 @@ def fit(
         ([(3e-4, 0.6, 0.3), (1e-5, -0.6, 0.3)], True, True),
     ],
 )
-def test_companions_are_compared_by_place_and_contrast(
-    companions: list[tuple[float, float, float]], lacks: bool, unconfirmed: bool
-) -> None:
+def test_companions_are_compared_by_place_and_contrast(companions, lacks, unconfirmed):
     fits = [fit(*companions)]
     assert lacks_candidates(fits, FOUND) is lacks
     assert (len(unconfirmed_companions(fits, FOUND)) > 0) is unconfirmed
 
 
-def test_every_fit_has_an_orientation_of_its_own() -> None:
+def test_every_fit_has_an_orientation_of_its_own():
     """Turned by 90 degrees counter-clockwise, (x, y) becomes (-y, x)."""
     turned = fit((3e-4, -0.3, 0.6), turned=90.0)
     assert not lacks_candidates([fit((3e-4, 0.6, 0.3)), turned], FOUND)
     assert lacks_candidates([fit((3e-4, 0.6, 0.3)), fit((3e-4, 0.6, 0.3), turned=90.0)], FOUND)
 
 
-def test_fits_of_reference_stars_have_no_candidates() -> None:
+def test_fits_of_reference_stars_have_no_candidates():
     assert not lacks_candidates([fit((3e-4, 0.6, 0.3)), fit(reference=True)], FOUND)
-
-
-def test_nothing_is_tried_where_the_data_are_explained() -> None:
-    explained = SimpleNamespace(status=dr.Status.CONVERGED)
-    assert with_raised_peaks([explained], None, FOUND, 0.2) is None  # type: ignore[list-item, arg-type]
 
 
 @pytest.mark.slow
@@ -91,9 +76,7 @@ def test_nothing_is_tried_where_the_data_are_explained() -> None:
         pytest.param(74, (24,), id="0.08 at 0.48 arcsec, brighter than the star behind the mask"),
     ],
 )
-def test_a_planet_that_ends_a_fit_at_a_wrong_wavefront_is_found(
-    seed: int, cycles: tuple[float, ...]
-) -> None:
+def test_a_planet_that_ends_a_fit_at_a_wrong_wavefront_is_found(seed, cycles):
     outcome = searched(seed, cycles=cycles)
     assert outcome.verdict == "found", outcome.scene
     assert not outcome.false
@@ -101,47 +84,8 @@ def test_a_planet_that_ends_a_fit_at_a_wrong_wavefront_is_found(
     assert abs(outcome.pull) < 4
 
 
-def test_a_step_is_linear_in_the_light_of_a_companion() -> None:
-    """The light is contrast times flux; in contrast and flux, a long step would be quadratic."""
-    start = {"flux": torch.tensor([2e5]), "background": torch.zeros(1)}
-    planet = dr.Planet.from_offset(0.1, 0.4, 0.3)
-    frames = tuple(
-        FrameUnknowns(("flux", "background"), start, modes=2, companions=(planet,),
-                      shows_companions=shows)
-        for shows in (True, False)
-    )  # fmt: skip
-    unknowns = Unknowns(frames, own=("flux",))
-    vector = unknowns.initial()
-    step = torch.zeros(len(vector))
-    first, other = (rows.rows[frames[0].where("flux")] for rows in unknowns.rows)
-    place = unknowns.where("companions").start
-    step[first], step[other], step[place] = 6e5, 9e5, -0.25
-    moved = unknowns.stepped(vector, step)
-    # 2e5 x 0.1, and its linear change 6e5 x 0.1 - 2e5 x 0.25.
-    assert float(moved[first] * moved[place]) == pytest.approx(2e4 + 6e4 - 5e4)
-    assert moved[other] == pytest.approx(1.1e6)
-    assert moved[place + 1 : place + 3].tolist() == pytest.approx([0.4, 0.3])
-
-
-def test_companions_are_taken_from_all_frames() -> None:
-    start = {"flux": torch.tensor([2e5])}
-    planets = [dr.Planet.from_offset(contrast, 0.4, 0.3) for contrast in (0.1, 0.2, 0.3)]
-    frames = tuple(FrameUnknowns(("flux",), start, modes=2, amplitude_modes=1) for _ in range(2))
-    unknowns = Unknowns(frames, own=("flux",), drift=1, blocks=((0,), (1,)))
-    vector = torch.arange(unknowns.size, dtype=torch.float64)
-    more, longer = unknowns.with_companions(planets, vector)
-    fewer, shorter = more.without_companions(torch.tensor([True, False, True]), longer)
-    assert fewer.frames[1].companions == (planets[1],)
-    assert shorter[fewer.where("companions")].tolist() == pytest.approx([0.2, 0.4, 0.3])
-    again, same = fewer.without_companions(torch.tensor([True]), shorter)
-    assert again == unknowns
-    assert same.tolist() == vector.tolist()
-
-
 @pytest.mark.parametrize("contrast", [0.0, 1e-3])
-def test_a_companion_that_was_an_error_of_the_wavefront_is_dropped(
-    contrast: float, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_companion_that_was_an_error_of_the_wavefront_is_dropped(contrast, caplog):
     """The alignment alone leaves peaks, which the wavefront explains; a planet stays."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)
     before, change = (dr.random_opd(k, npix=128) for k in (8, 9))
@@ -158,7 +102,7 @@ def test_a_companion_that_was_an_error_of_the_wavefront_is_dropped(
     assert fit.companions[:, 0].tolist() == pytest.approx([contrast] if contrast else [], rel=0.05)
 
 
-def test_a_companion_that_outshines_the_star_is_fitted_with_it() -> None:
+def test_a_companion_that_outshines_the_star_is_fitted_with_it():
     """Fitted alone, the star's flux would be negative. Few modes leave an error of 2 %."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)
     before, change = (dr.random_opd(k, npix=128) for k in (8, 9))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,20 +18,13 @@ from pyklip_diffrender.reduction import (
     in_words,
     write_comparison,
 )
-from pyklip_diffrender.reduction.several import _thumbnails, _tracks, sources_of
-from pyklip_diffrender.scene.product_headers import world_coordinates
+from pyklip_diffrender.reduction.several import sources_of
 
 MOTION = (0.28, -0.36)
 """Of AU Mic, arcsec per year."""
 
 
-def summary(
-    mjd: float,
-    places: list[tuple[float, float]],
-    error: float = 0.01,
-    filter: str = "F444W",
-    mag: float = 20.0,
-) -> dict[str, Any]:
+def summary(mjd, places, error=0.01, filter="F444W", mag=20.0):
     """What a reduction says about candidates at offsets to the east and north."""
     candidates = [
         {
@@ -59,7 +50,7 @@ def summary(
     }  # fmt: skip
 
 
-def test_filters_of_an_epoch_are_compared_by_place_and_colour() -> None:
+def test_filters_of_an_epoch_are_compared_by_place_and_colour():
     """One source in both filters, one in the first only, one beyond the curve of the other."""
     long = summary(59855.0, [(0.8, -0.5), (-0.5, 0.5), (1.5, 0.0)], mag=20.0)
     short = summary(59855.1, [(0.81, -0.5)], filter="F210M", mag=21.5)
@@ -86,7 +77,7 @@ def test_filters_of_an_epoch_are_compared_by_place_and_colour() -> None:
     assert sources_of([summary(59855.0, []), short | {"candidates": []}], []) == []
 
 
-def test_a_companion_moves_with_the_star_and_the_background_stays() -> None:
+def test_a_companion_moves_with_the_star_and_the_background_stays():
     years = 425 / 365.25
     bound, sky = np.array([0.8, -0.5]), np.array([-1.2, 1.0])
     first = summary(59855.0, [tuple(bound), tuple(sky)])
@@ -108,7 +99,7 @@ def test_a_companion_moves_with_the_star_and_the_background_stays() -> None:
     assert pair["chi2_with_star"] == pytest.approx(2e-4 / (2 * 1.09e-4), rel=1e-6)
 
 
-def test_a_star_that_hardly_moves_tells_nothing() -> None:
+def test_a_star_that_hardly_moves_tells_nothing():
     places = [(0.8, -0.5)]
     frames = [summary(59855.0, places), summary(60280.0, places)]
     (pair,) = compare_reductions(frames, (0.002, 0.001))
@@ -119,7 +110,7 @@ def test_a_star_that_hardly_moves_tells_nothing() -> None:
     assert compare_reductions([frames[0] | {"oriented": False}, frames[1]], MOTION) == []
 
 
-def test_the_page_of_epochs_links_to_each(tmp_path: Path) -> None:
+def test_the_page_of_epochs_links_to_each(tmp_path):
     folders = {
         "2022-10-03": summary(59855.0, [(0.8, -0.5)]), "2023-12-02": summary(60280.0, [(0.8, -0.5)])
     }  # fmt: skip
@@ -136,46 +127,7 @@ def test_the_page_of_epochs_links_to_each(tmp_path: Path) -> None:
     assert "There are no candidates" in html.read_text(encoding="utf-8")
 
 
-def images_file(path: Path) -> None:
-    """The part of images.fits that the comparison shows."""
-    y, x = np.mgrid[-4:5, -4:5]
-    grid = 0.2 * np.stack([x, y], axis=-1)
-    observation = dr.Observation.from_arrays(
-        np.ones((9, 9)), np.ones((9, 9)), pixelscale=0.2, center=(4.0, 4.0), position_angles=0.0
-    )
-    snr = fits.ImageHDU(1.0 * x, world_coordinates(grid, observation), "SNR")
-    path.parent.mkdir()
-    fits.HDUList([fits.PrimaryHDU(), snr]).writeto(path)
-
-
-def test_the_page_has_thumbnails_and_the_track_of_a_background_star(tmp_path: Path) -> None:
-    first, second = summary(59855.0, [(0.6, -0.2)]), summary(60280.0, [(0.3, 0.2), (2.0, 2.0)])
-    folders = {"a": first, "b": second}
-    images_file(tmp_path / "a" / "images.fits")
-    text = write_comparison(folders, MOTION, tmp_path)[0].read_text(encoding="utf-8")
-    # The folder b has no products; there is one candidate at the first epoch.
-    assert text.count('<img src="data:image/png;base64,iVBOR') == 2
-    (thumbnail,) = _thumbnails(folders, tmp_path)
-    ax = thumbnail.figure.axes[0]
-    left, right, bottom, top = ax.images[0].get_extent()
-    assert [left, right, bottom, top] == pytest.approx([-0.9, 0.9, -0.9, 0.9])
-    (circles,) = (line for line in ax.lines if line.get_label() == "companions")
-    # East is left.
-    np.testing.assert_allclose(np.ravel(circles.get_data()), [-0.6, -0.2])
-    (track,) = _tracks([first, second], MOTION)
-    (way,) = (each for each in track.figure.axes[0].lines if "background" in each.get_label())
-    years = 425 / 365.25
-    expected = [[0.6, -0.2], [0.6 - MOTION[0] * years, -0.2 - MOTION[1] * years]]
-    np.testing.assert_allclose(np.stack(way.get_data(), axis=1), expected)
-    limits = track.figure.axes[0].get_xlim()
-    assert limits[0] > limits[1]
-    # Without a proper motion, a second epoch, or a candidate there is none.
-    assert _tracks([first, second], None) == []
-    assert _tracks([first, summary(59856.0, [], filter="F210M")], MOTION) == []
-    assert _tracks([summary(59855.0, []), summary(60280.0, [])], MOTION) == []
-
-
-def test_the_page_has_a_table_of_candidates_over_filters(tmp_path: Path) -> None:
+def test_the_page_has_a_table_of_candidates_over_filters(tmp_path):
     folders = {
         "F444W": summary(59855.0, [(0.8, -0.5), (-0.5, 0.5)]),
         "F210M": summary(59855.1, [(0.8, -0.5)], filter="F210M", mag=21.5),
@@ -189,7 +141,7 @@ def test_the_page_has_a_table_of_candidates_over_filters(tmp_path: Path) -> None
     assert len(json.loads(data.read_text(encoding="utf-8"))["sources"]) == 2
 
 
-def test_the_page_shows_the_combined_search(tmp_path: Path) -> None:
+def test_the_page_shows_the_combined_search(tmp_path):
     folders = {"2022": summary(59855.0, []), "2023": summary(60280.0, [])}
     place = (0.5, 0.45, 9.0)
     found = [searched("F444W", 1, [place], mjd=59855.0), searched("F444W", 2, [place], mjd=60280.0)]
@@ -213,7 +165,7 @@ def test_the_page_shows_the_combined_search(tmp_path: Path) -> None:
     assert content["combined"] == {"reason": "the star's proper motion <b>"}
 
 
-def dry_run(folder: Path) -> list[str]:
+def dry_run(folder):
     """Arguments of a dry run on frames in a folder, with a wavefront map that is made here."""
     opd = folder / "opd.fits"
     hdu = fits.PrimaryHDU(np.random.default_rng(1).normal(0, 30, (64, 64)))
@@ -223,9 +175,7 @@ def dry_run(folder: Path) -> list[str]:
     return ["reduce", frames, "--opd", str(opd), "-o", output, "--dry-run"]
 
 
-def test_the_command_shows_every_epoch_and_every_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_shows_every_epoch_and_every_file(tmp_path, capsys):
     frames = tmp_path / "frames"
     calints(frames / "a.fits")
     calints(frames / "b.fits", observation=2, date="2023-12-01T06:00:00", roll=90.0)
@@ -239,9 +189,7 @@ def test_the_command_shows_every_epoch_and_every_file(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_takes_every_filter_of_the_target(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_takes_every_filter_of_the_target(tmp_path, capsys):
     frames = tmp_path / "frames"
     pixel = {"PIXAR_SR": 9.2e-14}
     calints(frames / "a.fits", cards=pixel)

@@ -10,7 +10,7 @@ from pyklip_diffrender.detection.disk import ConnectedLight
 RESOLUTION = 2.3
 
 
-def image(points: dict[tuple[int, int], float] | None = None, row: int | None = None) -> np.ndarray:
+def image(points=None, row=None):
     """S/N of sources, with those of a row 20 each, (48, 48)."""
     snr = np.zeros((48, 48))
     if row is not None:
@@ -20,7 +20,7 @@ def image(points: dict[tuple[int, int], float] | None = None, row: int | None = 
     return snr
 
 
-def test_the_beam_keeps_the_peak_of_a_point_and_the_opening_takes_it() -> None:
+def test_the_beam_keeps_the_peak_of_a_point_and_the_opening_takes_it():
     light = ConnectedLight(image({(24, 24): 30.0}), RESOLUTION)
     assert light.smoothed[24, 24] == pytest.approx(30.0, rel=0.02)
     assert light.opened[24, 24] < 0.03 * 30
@@ -30,7 +30,7 @@ def test_the_beam_keeps_the_peak_of_a_point_and_the_opening_takes_it() -> None:
 
 
 @pytest.mark.parametrize("angle", [0, 20, 45, 77, 90])
-def test_a_narrow_line_is_extended_in_any_direction(angle: float) -> None:
+def test_a_narrow_line_is_extended_in_any_direction(angle):
     snr = np.zeros((48, 48))
     along = np.arange(-15, 16)
     turn = np.deg2rad(angle)
@@ -43,7 +43,7 @@ def test_a_narrow_line_is_extended_in_any_direction(angle: float) -> None:
     assert 0.05 < light.region.mean() < 0.2
 
 
-def test_points_beside_a_line_are_none_of_it_and_those_next_to_it_are() -> None:
+def test_points_beside_a_line_are_none_of_it_and_those_next_to_it_are():
     away = ConnectedLight(image({(32, 24): 30.0}, row=22), RESOLUTION)
     assert not away.is_extended[32, 24]
     assert away.is_extended[22, 24]
@@ -58,7 +58,7 @@ def test_points_beside_a_line_are_none_of_it_and_those_next_to_it_are() -> None:
     assert reach.max() <= 22 + 2.3 * RESOLUTION
 
 
-def test_what_hides_points_is_where_one_would_count_as_extended() -> None:
+def test_what_hides_points_is_where_one_would_count_as_extended():
     """By adding it, at every tenth pixel; its own light on both sides of the estimate differs."""
     snr = image(row=22)
     hides = ConnectedLight(snr, RESOLUTION).hides_points
@@ -70,12 +70,12 @@ def test_what_hides_points_is_where_one_would_count_as_extended() -> None:
 
 
 @pytest.mark.parametrize(("brightness", "expected"), [(0.3, False), (0.9, False), (20.0, True)])
-def test_the_faintest_region(brightness: float, expected: bool) -> None:
+def test_the_faintest_region(brightness, expected):
     """Neighbours add to 2.4 in the beam: the second is brighter than 1, but nowhere than 3."""
     assert ConnectedLight(image(row=22) * brightness / 20, RESOLUTION).region.any() == expected
 
 
-def test_errors_of_the_model_about_a_bright_source_are_no_extended_light() -> None:
+def test_errors_of_the_model_about_a_bright_source_are_no_extended_light():
     line = ConnectedLight(image(row=22), RESOLUTION)
     assert line.is_extended[22].any()
     beside = ConnectedLight(image({(40, 24): 1000.0}, row=22), RESOLUTION)

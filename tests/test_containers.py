@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -28,33 +26,31 @@ VALUES = np.arange(1.0, 13.0).reshape(3, 4)
 MASK = VALUES % 5 == 0
 SURFACE = u.MJy / u.sr
 
-Unit = u.UnitBase | None
 
-
-def quantity(values: Any, mask: Any, unit: Unit) -> Any:
+def quantity(values, mask, unit):
     values = values if mask is None else Masked(values, mask=mask)
     return values if unit is None else values << unit
 
 
-def numpy_masked(values: Any, mask: Any, unit: Unit) -> Any:
+def numpy_masked(values, mask, unit):
     assert unit is None
     return np.ma.MaskedArray(values, mask=np.zeros(values.shape, bool) if mask is None else mask)
 
 
-def nddata(values: Any, mask: Any, unit: Unit) -> Any:
+def nddata(values, mask, unit):
     return NDData(values, mask=mask, unit=unit)
 
 
-def nddata_of_masked(values: Any, mask: Any, unit: Unit) -> Any:
+def nddata_of_masked(values, mask, unit):
     return NDData(values if mask is None else Masked(values, mask=mask), unit=unit)
 
 
-def ccddata(values: Any, mask: Any, unit: Unit) -> Any:
+def ccddata(values, mask, unit):
     flags = None if mask is None else np.where(mask, 4, 0)  # Bits of a data-quality array.
     return CCDData(values, mask=flags, unit=unit)
 
 
-def column(values: Any, mask: Any, unit: Unit) -> Any:
+def column(values, mask, unit):
     return (
         MaskedColumn(values, mask=mask, unit=unit)
         if mask is not None
@@ -62,27 +58,27 @@ def column(values: Any, mask: Any, unit: Unit) -> Any:
     )
 
 
-def of_qtable(values: Any, mask: Any, unit: Unit) -> Any:
+def of_qtable(values, mask, unit):
     return QTable({"flux": quantity(values, mask, unit)})["flux"]
 
 
-def of_table(values: Any, mask: Any, unit: Unit) -> Any:
+def of_table(values, mask, unit):
     table = Table({"flux": np.ma.MaskedArray(values, mask=mask) if mask is not None else values})
     table["flux"].unit = unit
     return table["flux"]
 
 
-def rows(values: Any, mask: Any, unit: Unit) -> Any:
+def rows(values, mask, unit):
     return [
         quantity(values[k], None if mask is None else mask[k], unit) for k in range(len(values))
     ]
 
 
-def rows_of_ccddata(values: Any, mask: Any, unit: Unit) -> Any:
+def rows_of_ccddata(values, mask, unit):
     return [ccddata(values[k], None if mask is None else mask[k], unit) for k in range(len(values))]
 
 
-def rows_of_rows(values: Any, mask: Any, unit: Unit) -> Any:
+def rows_of_rows(values, mask, unit):
     return [tuple(quantity(values[k], None if mask is None else mask[k], unit)) for k in range(3)]
 
 
@@ -95,9 +91,7 @@ CONTAINERS = [
 @pytest.mark.parametrize("unit", [None, SURFACE, u.Jy / u.sr], ids=str)
 @pytest.mark.parametrize("mask", [None, MASK], ids=["all", "masked"])
 @pytest.mark.parametrize("container", CONTAINERS)
-def test_masked_values_are_nan_and_units_are_converted(
-    container: Any, mask: Any, unit: Unit
-) -> None:
+def test_masked_values_are_nan_and_units_are_converted(container, mask, unit):
     if unit is not None and container is numpy_masked:
         pytest.skip("numpy has no units")
     if unit is None and container in (ccddata, rows_of_ccddata):
@@ -119,7 +113,7 @@ def test_masked_values_are_nan_and_units_are_converted(
 
 
 @pytest.mark.parametrize("container", [quantity, nddata, ccddata, column, rows, rows_of_ccddata])
-def test_an_observation_masks_what_its_container_masks(container: Any) -> None:
+def test_an_observation_masks_what_its_container_masks(container):
     frame = container(1e6 * VALUES, MASK, u.Jy / u.sr)
     got = dr.Observation.from_arrays(
         frame, StdDevUncertainty(VALUES, unit=SURFACE), unit="MJy/sr", pixelscale=0.063
@@ -129,14 +123,14 @@ def test_an_observation_masks_what_its_container_masks(container: Any) -> None:
     np.testing.assert_allclose(got.error[0], np.where(MASK, 1, VALUES))
 
 
-def test_a_column_in_centimetres_is_a_length() -> None:
+def test_a_column_in_centimetres_is_a_length():
     assert to_metres(Table({"x": Column([150.0], unit="cm")})["x"], "x") == pytest.approx([1.5])
     assert dr.Observation.from_arrays(
         VALUES, VALUES, pixelscale=Column([63.0, 64.0], unit="mas")
     ).pixelscale == pytest.approx((0.063, 0.064))
 
 
-def test_masks_of_masks() -> None:
+def test_masks_of_masks():
     valid = np.ma.MaskedArray(np.ones((3, 4), bool), mask=MASK)
     got = dr.Observation.from_arrays(VALUES, VALUES, valid=valid, pixelscale=0.063)
     np.testing.assert_array_equal(got.valid[0], ~MASK)
@@ -167,12 +161,12 @@ def test_masks_of_masks() -> None:
         ([[1.0, 2.0] * SURFACE, [3.0] * SURFACE], ShapeError, r"members of shapes \(2,\), \(1,\)"),
     ],
 )
-def test_what_cannot_be_taken_is_refused_by_name(value: Any, error: type, words: str) -> None:
+def test_what_cannot_be_taken_is_refused_by_name(value, error, words):
     with pytest.raises(error, match=words) as caught:
         to_unit(value, SURFACE, "data")
     assert isinstance(caught.value, DiffrenderError)
 
 
-def test_a_position_in_another_unit_than_pixels_is_refused() -> None:
+def test_a_position_in_another_unit_than_pixels_is_refused():
     with pytest.raises(UnitError, match="center: got the unit 'arcsec'"):
         dr.Observation.from_arrays(VALUES, VALUES, pixelscale=0.063, center=[1, 2] * u.arcsec)

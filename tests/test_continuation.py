@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -13,8 +12,8 @@ import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.optics import OpticalSystem, PupilGrid
-from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine_again
+from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.refinement import GaussNewton, Status, refine_again
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior, default_basis, random_opd
 
@@ -26,17 +25,17 @@ ROLL = 10.0
 
 
 @cache
-def model() -> OpticalSystem:
+def model():
     return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
 
 
 @cache
-def before() -> np.ndarray:
+def before():
     return random_opd(3, npix=NPIX).data
 
 
 @cache
-def later(cycles: float = CYCLES[0]) -> np.ndarray:
+def later(cycles=CYCLES[0]):
     """Moved by modes up to `cycles`; by default those that both bases have."""
     basis = default_basis(cycles)
     generator = torch.Generator().manual_seed(1)
@@ -47,12 +46,12 @@ def later(cycles: float = CYCLES[0]) -> np.ndarray:
 
 
 @cache
-def star(offset: tuple[float, float] = OFFSET, cycles: float = CYCLES[0]) -> np.ndarray:
+def star(offset=OFFSET, cycles=CYCLES[0]):
     return FLUX * model()(later(cycles), offset).numpy()
 
 
 @cache
-def shot(k: int = 0, planet: Planet | None = None, cycles: float = CYCLES[0]) -> Observation:
+def shot(k=0, planet=None, cycles=CYCLES[0]):
     """A frame; later ones are rolled."""
     expected = star(cycles=cycles)
     if planet is not None:
@@ -69,16 +68,13 @@ def shot(k: int = 0, planet: Planet | None = None, cycles: float = CYCLES[0]) ->
     )
 
 
-def settings(**changes: object) -> GaussNewton:
-    return GaussNewton(**{"cycles": CYCLES, "response_npix": 64, **changes})  # type: ignore[arg-type]
+def settings(**changes):
+    return GaussNewton(**{"cycles": CYCLES, "response_npix": 64, **changes})
 
 
-def pulls(fit: Refinement, k: int, truth: np.ndarray) -> np.ndarray:
+def pulls(fit, k, truth):
     """Error of the fitted star in frame k, in sigma."""
     return (fit.frames[k].star - truth) / np.sqrt(truth + READ_NOISE**2)
-
-
-# -- more modes ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -89,7 +85,7 @@ def pulls(fit: Refinement, k: int, truth: np.ndarray) -> np.ndarray:
         (False, 2),
     ],
 )
-def test_every_way_a_fit_can_go_on(grown: bool, count: int) -> None:
+def test_every_way_a_fit_can_go_on(grown, count):
     """Basis grown, where the wavefront has finer modes, or not, one frame or two."""
     frames = [shot(k, cycles=CYCLES[grown]) for k in range(count)]
     fit = dr.refine(model(), frames, before(), settings=settings())
@@ -107,7 +103,7 @@ def test_every_way_a_fit_can_go_on(grown: bool, count: int) -> None:
 
 
 @pytest.mark.slow
-def test_drifts_and_a_known_companion_go_on() -> None:
+def test_drifts_and_a_known_companion_go_on():
     drift = WavefrontPrior(scales={"segment": 0.5, "texture": 0.02})
     fit = dr.refine(
         model(),
@@ -118,14 +114,13 @@ def test_drifts_and_a_known_companion_go_on() -> None:
     assert fit.status is Status.CONVERGED
     assert set(fit.scales) == {"segment", "texture", "segment drift", "texture drift"}
     again = refine_again(fit, max_iterations=4)
-    assert again.settings.drift is not None
     # The scales of both priors go on from where the fit had left them.
     assert again.settings.drift.scales != drift.scales
     ((contrast, *_),) = again.companions
     assert contrast == pytest.approx(PLANET.contrast, rel=0.03)
 
 
-def test_a_companion_can_be_added_to_a_fit() -> None:
+def test_a_companion_can_be_added_to_a_fit():
     faint = replace(PLANET, contrast=3e-4)
     kept = settings(companions_if_stalled=False, grow_basis=False, cycles=4.0)
     fit = dr.refine(model(), shot(0, faint), before(), settings=kept)
@@ -137,7 +132,7 @@ def test_a_companion_can_be_added_to_a_fit() -> None:
 
 
 @pytest.mark.slow
-def test_a_fit_that_fails_is_not_searched() -> None:
+def test_a_fit_that_fails_is_not_searched():
     dark = replace(shot(), data=-shot().data)
     fit = dr.refine(model(), dark, before(), settings=settings())
     assert fit.status is Status.DIVERGED
@@ -145,11 +140,8 @@ def test_a_fit_that_fails_is_not_searched() -> None:
         dr.detect(fit)
 
 
-# -- other settings ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("change", [{}, {"wavefront": False}], ids=["wavefront", "alignment"])
-def test_a_fit_with_a_basis_of_its_own_can_go_on(change: dict[str, bool]) -> None:
+def test_a_fit_with_a_basis_of_its_own_can_go_on(change):
     """A basis without segments: the prior of those stays as it was."""
     own = settings(basis=FourierModes(3), max_iterations=6, **change)
     fit = dr.refine(model(), shot(), before(), settings=own)
@@ -166,7 +158,7 @@ def test_a_fit_with_a_basis_of_its_own_can_go_on(change: dict[str, bool]) -> Non
         assert first < 0.9 * fit.history[0]["chi2_per_pixel"]
 
 
-def test_a_fit_goes_on_from_where_it_ended() -> None:
+def test_a_fit_goes_on_from_where_it_ended():
     """With a smallest error of the model, and a pattern in the frame that no wavefront explains."""
     rng = np.random.default_rng(9)
     frame = shot()
@@ -194,19 +186,17 @@ def test_a_fit_goes_on_from_where_it_ended() -> None:
         ({"start": [{}, {}, {}]}, r"start: got 3 dicts for 2 observations"),
     ],
 )
-def test_arguments_that_do_not_go_together_are_refused(
-    arguments: dict[str, object], complaint: str
-) -> None:
+def test_arguments_that_do_not_go_together_are_refused(arguments, complaint):
     with pytest.raises(ValueError, match=complaint):
-        dr.refine(model(), [shot(0), shot(1)], before(), **arguments)  # type: ignore[arg-type]
+        dr.refine(model(), [shot(0), shot(1)], before(), **arguments)
 
 
-def test_arguments_in_another_order_are_refused() -> None:
+def test_arguments_in_another_order_are_refused():
     with pytest.raises(IncompatibleSetupError, match="order of the arguments"):
-        dr.refine(before(), shot(), model())  # type: ignore[arg-type]
+        dr.refine(before(), shot(), model())
 
 
-BAD: Sequence[tuple[dict[str, object], str]] = [
+BAD = [
     ({"cycles": ()}, r"cycles: got none, expected at least one, such as 24"),
     ({"cycles": (24.0, -1.0)}, r"cycles: got \(24\.0, -1\.0\), expected positive"),
     ({"cycles": math.nan}, r"cycles: got \(nan,\), expected positive"),
@@ -231,16 +221,14 @@ BAD: Sequence[tuple[dict[str, object], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "complaint"), BAD)
-def test_settings_that_cannot_be_are_refused_when_they_are_made(
-    changes: dict[str, object], complaint: str
-) -> None:
+def test_settings_that_cannot_be_are_refused_when_they_are_made(changes, complaint):
     with pytest.raises(IncompatibleSetupError, match=complaint):
-        GaussNewton(**changes)  # type: ignore[arg-type]
+        GaussNewton(**changes)
     with pytest.raises(IncompatibleSetupError, match=complaint):
         GaussNewton.nircam(**changes)
 
 
-def test_modes_of_the_preset_reach_the_edge_of_the_fitted_square() -> None:
+def test_modes_of_the_preset_reach_the_edge_of_the_fitted_square():
     expected = {"F444W": 18, "F480M": 16, "F356W": 22, "F250M": 32, "F210M": 18}
     for name, cycles in expected.items():
         assert GaussNewton.nircam(name).cycles == (cycles,)
@@ -251,7 +239,7 @@ def test_modes_of_the_preset_reach_the_edge_of_the_fitted_square() -> None:
 
 
 @pytest.mark.parametrize("cycles", [6, 6.0, (6,), [6.0], np.float64(6)])
-def test_a_single_number_of_cycles_will_do(cycles: object) -> None:
-    made = GaussNewton(cycles=cycles, free=["flux"], companions=[PLANET])  # type: ignore[arg-type]
+def test_a_single_number_of_cycles_will_do(cycles):
+    made = GaussNewton(cycles=cycles, free=["flux"], companions=[PLANET])
     assert made == GaussNewton(cycles=(6.0,), free=("flux",), companions=(PLANET,))
-    assert GaussNewton.nircam(cycles=cycles).cycles == (6.0,)  # type: ignore[arg-type]
+    assert GaussNewton.nircam(cycles=cycles).cycles == (6.0,)

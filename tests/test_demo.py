@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -17,7 +15,7 @@ from pyklip_diffrender.scene import ALPHA_PICTORIS_W2, Scene, Star, star_photons
 from pyklip_diffrender.wavefront import random_opd
 
 
-def test_references_are_nine_dithered_frames_of_the_reference_star() -> None:
+def test_references_are_nine_dithered_frames_of_the_reference_star():
     model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=20)
     opd = random_opd(2, npix=128).data
     frames = simulate_references(model, opd, seed=7)
@@ -33,7 +31,7 @@ def test_references_are_nine_dithered_frames_of_the_reference_star() -> None:
 
 
 @pytest.mark.slow
-def test_the_demo_finds_the_planet_that_klip_loses(tmp_path: Path) -> None:
+def test_the_demo_finds_the_planet_that_klip_loses(tmp_path):
     result = run_demo(size=48)
     table = result.table
     assert table.colnames == [

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,13 +23,11 @@ from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection
-from pyklip_diffrender.detection.candidates import calibration_errors, with_companions
+from pyklip_diffrender.detection.candidates import with_companions
 from pyklip_diffrender.errors import (
     CorruptFileError,
+    DiffrenderError,
     IncompatibleSetupError,
-    NonFiniteError,
-    ShapeError,
-    UnitError,
 )
 from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics.grid import PupilGrid
@@ -51,8 +46,6 @@ WHERE = Planet(0.0, 0.7, 60.0)
 FAINT = replace(WHERE, contrast=2e-6)
 """Below the S/N at which the star is refined again."""
 
-NOT_LOOKING = {"companions_if_stalled": False, "grow_basis": False, "coarse_first": False}
-"""With a model error that is allowed for, fits do not look for companions by themselves."""
 
 Image = NDArray[np.float64]
 
@@ -67,7 +60,7 @@ class World:
     basis: JointBasis
     _made: dict[object, Refinement | Detection] = field(default_factory=dict, init=False)
 
-    def expected(self, *planets: Planet, offset: tuple[float, float] = (0.0, 0.0)) -> Image:
+    def expected(self, *planets, offset=(0.0, 0.0)):
         """Expected photons of star and planets."""
         total = FLUX * self.model(self.later, offset).numpy()
         for planet in planets:
@@ -75,36 +68,32 @@ class World:
             total = total + planet.contrast * FLUX * self.model(self.later, place).numpy()
         return total
 
-    def observed(self, expected: Image, seed: int, **details: object) -> Observation:
+    def observed(self, expected, seed, **details):
         rng = np.random.default_rng(seed)
         counts = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
         error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
         scale = self.model.detector.pixelscale
         return Observation.from_arrays(counts, error, pixelscale=scale, **details)
 
-    def fitted(self, seed: int, *planets: Planet, **changes: object) -> Refinement:
+    def fitted(self, seed, *planets, **changes):
         key = ("fit", seed, planets, tuple(sorted(changes.items())))
         if key not in self._made:
             observation = self.observed(self.expected(*planets), seed)
             self._made[key] = self.refined(observation, **changes)
-        return self._made[key]  # type: ignore[return-value]
+        return self._made[key]
 
-    def detected(self, seed: int, *planets: Planet, **changes: object) -> Detection:
+    def detected(self, seed, *planets, **changes):
         key = ("detection", seed, planets, tuple(sorted(changes.items())))
         if key not in self._made:
             self._made[key] = dr.detect(self.fitted(seed, *planets, **changes))
-        return self._made[key]  # type: ignore[return-value]
+        return self._made[key]
 
-    def refined(
-        self, observation: Observation | Sequence[Observation], **changes: object
-    ) -> Refinement:
-        settings = GaussNewton(
-            **{"basis": self.basis, "response_npix": self.model.npix, **changes}  # type: ignore[arg-type]
-        )
+    def refined(self, observation, **changes):
+        settings = GaussNewton(**{"basis": self.basis, "response_npix": self.model.npix, **changes})
         return refine(self.model, observation, self.opd, settings=settings)
 
 
-def drifted(npix: int, size: int, cycles: float) -> World:
+def drifted(npix, size, cycles):
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=npix, fov_pixels=size)
     basis = JointBasis([SegmentMotions(), FourierModes(cycles)])
     opd = random_opd(3, npix=npix).data
@@ -115,42 +104,37 @@ def drifted(npix: int, size: int, cycles: float) -> World:
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
+def world():
     """Small enough for a fit in half a second."""
     return drifted(64, 32, 4.0)
 
 
 @pytest.fixture(scope="module")
-def large() -> World:
+def large():
     """With as many modes as bright companions need, which a wavefront must not imitate."""
     return drifted(128, 40, 8.0)
 
 
 @pytest.fixture(scope="module")
-def empty(world: World) -> list[Detection]:
+def empty(world):
     """Three frames without a planet."""
     return [world.detected(seed) for seed in range(3)]
 
 
 @pytest.fixture(scope="module")
-def one(world: World) -> Detection:
+def one(world):
     """A planet of S/N 44 or so."""
     return world.detected(11, replace(WHERE, contrast=1e-5))
 
 
-def radius(found: Detection) -> Image:
+def radius(found):
     return np.asarray(np.hypot(found.grid[..., 0], found.grid[..., 1]))
-
-
-# -- calibration -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("size", "count"), [("world", 3), pytest.param("large", 6, marks=pytest.mark.study)]
 )
-def test_snr_scatters_by_one_where_there_is_nothing(
-    request: pytest.FixtureRequest, size: str, count: int
-) -> None:
+def test_snr_scatters_by_one_where_there_is_nothing(request, size, count):
     empty = [request.getfixturevalue(size).detected(seed) for seed in range(count)]
     inside = radius(empty[0]) > 0.25
     values = np.concatenate([found.snr[inside] for found in empty])
@@ -162,37 +146,25 @@ def test_snr_scatters_by_one_where_there_is_nothing(
     assert all(len(found.sources) == 0 for found in empty)
 
 
-def test_the_freedom_of_the_wavefront_costs_something_everywhere(empty: list[Detection]) -> None:
+def test_the_freedom_of_the_wavefront_costs_something_everywhere(empty):
     ratio = empty[0].error / empty[0].photon_error
     seen = radius(empty[0]) > 0.25
     assert ratio[seen].min() > 1.0
     assert 1.02 < np.median(ratio[seen]) < 2.0
 
 
-def test_ignoring_the_wavefront_would_be_noticed(world: World) -> None:
-    """What the calibration tests are there for: errors of a known star are far too small."""
-    fit = world.fitted(0)
-    frozen = replace(fit.linear, deviation=1e-6 * torch.ones_like(fit.linear.deviation))
-    outdated = FLUX * world.model(world.opd).numpy()
-    residual = torch.from_numpy(fit.frames[0].observation.data[0] - outdated)
-    part = replace(frozen.frames[0], residual=residual)
-    frozen = replace(frozen, frames=(part,), vector=frozen.mean)
-    found = dr.detect(replace(fit, stored_linear=frozen), threshold=math.inf)
-    assert found.snr[radius(found) > 0.25].std() > 1.5
-
-
 FEW = JointBasis([SegmentMotions(), FourierModes(4)])
 
 
 @cache
-def small() -> tuple[OpticalSystem, Image]:
+def small():
     """A system whose fits take less than a second, and an old wavefront."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=32)
     return model, random_opd(3, npix=64).data
 
 
 @cache
-def pulls(seed: int) -> tuple[float, float | None, float | None]:
+def pulls(seed):
     """Errors of a planet's contrast, x and y over those stated; new wavefront, place and noise.
 
     None for the position of a planet that is not above the threshold.
@@ -220,7 +192,7 @@ def pulls(seed: int) -> tuple[float, float | None, float | None]:
 
 
 @pytest.mark.slow
-def test_contrast_and_place_of_planets_are_unbiased_and_their_errors_right() -> None:
+def test_contrast_and_place_of_planets_are_unbiased_and_their_errors_right():
     """Errors that are wrong by a factor of 1.4 do not pass.
 
     The deviation of 32 pulls is known to 13 %, of 64 to 9 %.
@@ -234,19 +206,6 @@ def test_contrast_and_place_of_planets_are_unbiased_and_their_errors_right() -> 
         assert 1 / within < drawn.std() < within
 
 
-def test_the_subtracted_frame_has_lost_light_that_the_measurement_has_not(world: World) -> None:
-    # Too near for the fit to look for it by itself.
-    planet = Planet(1e-5, 0.33, 60.0)
-    fit = world.fitted(7, planet)
-    assert not len(fit.companions)
-    light = world.expected(planet) - world.expected()
-    weight = light / fit.frames[0].observation.error[0] ** 2
-    kept = float((weight * fit.frames[0].residual[0]).sum() / (weight * light).sum())
-    measured = float(dr.measure(fit, [planet.offset])["contrast"][0]) / 1e-5
-    assert kept < 0.9
-    assert measured == pytest.approx(1.0, abs=0.2)
-
-
 @pytest.mark.parametrize(
     ("size", "contrast"),
     [
@@ -255,9 +214,7 @@ def test_the_subtracted_frame_has_lost_light_that_the_measurement_has_not(world:
         pytest.param("large", 1e-3, marks=pytest.mark.slow),
     ],
 )
-def test_a_bright_companion_gets_parameters_of_its_own(
-    request: pytest.FixtureRequest, size: str, contrast: float
-) -> None:
+def test_a_bright_companion_gets_parameters_of_its_own(request, size, contrast):
     """Without them the wavefront bends to it, and nothing converges."""
     world = request.getfixturevalue(size)
     planet = replace(WHERE, contrast=contrast)
@@ -270,41 +227,15 @@ def test_a_bright_companion_gets_parameters_of_its_own(
     assert fit.frames[0].star == pytest.approx(world.expected(), rel=0.02, abs=100)
 
 
-@pytest.mark.parametrize(
-    ("contrast", "seed", "again"),
-    [(4e-6, 7, False), pytest.param(1e-5, 11, True, marks=pytest.mark.slow)],
-)
-def test_only_what_bends_the_wavefront_far_has_it_fitted_anew(
-    world: World, contrast: float, seed: int, again: bool
-) -> None:
-    fit = world.fitted(seed, replace(WHERE, contrast=contrast))
-    assert len(fit.companions) == 1
-    before_wavefront = itertools.takewhile(lambda record: not record["wavefront"], fit.history)
-    first = len(list(before_wavefront))
-    alignments = [record for record in fit.history[first:] if not record["wavefront"]]
-    assert alignments  # A new companion's position is fitted first, with the wavefront held.
-    assert any(record["kappa"] > 0.01 for record in alignments) == again
-
-
 @pytest.mark.slow
-def test_what_a_fit_took_for_a_companion_need_not_be_one(world: World) -> None:
+def test_what_a_fit_took_for_a_companion_need_not_be_one(world):
     observation = world.observed(world.expected(), 4)
     fit = world.refined(observation, companions=(replace(WHERE, contrast=1e-6),))
     assert len(fit.companions) == 1
     assert len(dr.detect(fit).candidates) == 0
 
 
-def test_a_prior_that_is_held_too_narrow_is_noticed(world: World) -> None:
-    observation = world.observed(world.expected(), 4)
-    scales = world.fitted(4).scales
-    for factor, status in ((1.0, Status.CONVERGED), (1 / 3, Status.PRIOR_MISMATCH)):
-        held = WavefrontPrior({k: factor * v for k, v in scales.items()}, fit_scales=False)
-        fit = world.refined(observation, prior=held)
-        assert fit.status is status
-        assert fit.status.calibrated == (factor == 1.0)
-
-
-def test_a_prior_that_is_held_too_narrow_is_widened(world: World) -> None:
+def test_a_prior_that_is_held_too_narrow_is_widened(world):
     observation = world.observed(world.expected(), 4)
     likely = world.fitted(4)
     assert not likely.prior_ratios
@@ -315,20 +246,21 @@ def test_a_prior_that_is_held_too_narrow_is_widened(world: World) -> None:
     # Too few modes of the texture are determined.
     assert fit.scales["segment"] == pytest.approx(likely.scales["segment"], rel=0.15)
     assert fit.scales["texture"] == pytest.approx(narrow["texture"])
-    assert isinstance(fit.settings, GaussNewton)
     assert fit.settings.prior.scales == pytest.approx(fit.scales)
     # The steps after it are in the history.
     unwidened = world.refined(observation, prior=held)
     assert unwidened.status is Status.PRIOR_MISMATCH
+    assert not unwidened.status.calibrated
     assert [record["iteration"] for record in fit.history] == list(range(len(fit.history)))
     assert len(fit.history) > len(unwidened.history)
     # A prior that holds is left alone.
     right = WavefrontPrior(likely.scales, fit_scales=False)
     kept = world.refined(observation, prior=right, widen_prior=True)
+    assert kept.status is Status.CONVERGED
     assert kept.scales == pytest.approx(likely.scales)
 
 
-def test_the_prior_of_the_amplitude_is_widened_as_well(world: World) -> None:
+def test_the_prior_of_the_amplitude_is_widened_as_well(world):
     absorbing = 6e-9 * torch.randn(
         len(world.basis), dtype=torch.float64, generator=torch.Generator().manual_seed(2)
     )
@@ -346,12 +278,11 @@ def test_the_prior_of_the_amplitude_is_widened_as_well(world: World) -> None:
     assert before.prior_ratios["amplitude"] > 3
     assert fit.status is Status.CONVERGED
     assert fit.prior_ratios["amplitude"] == pytest.approx(1.0, abs=0.15)
-    assert isinstance(fit.settings, GaussNewton)
     widened = fit.settings.prior.amplitude_scale / narrow.amplitude_scale
     assert widened == pytest.approx(before.prior_ratios["amplitude"], rel=0.15)
 
 
-def test_a_planet_does_not_make_the_noise_larger(world: World) -> None:
+def test_a_planet_does_not_make_the_noise_larger(world):
     planet = FAINT
     quiet, fit = world.fitted(5), world.fitted(5, planet)
     noise, found = world.detected(5), world.detected(5, planet)
@@ -366,14 +297,14 @@ def test_a_planet_does_not_make_the_noise_larger(world: World) -> None:
     assert thrice["snr"].tolist() == pytest.approx([once["snr"][0]] * 3, rel=1e-4)
 
 
-def test_weights_for_outliers_do_not_hide_structure(world: World) -> None:
+def test_weights_for_outliers_do_not_hide_structure(world):
     fit = world.refined(world.observed(world.expected(), 5), robust=3.0)
     assert fit.reduced_chi2 > 1.02
     assert dr.detect(fit).scatter == pytest.approx(math.sqrt(fit.reduced_chi2), rel=1e-6)
 
 
 @pytest.mark.slow
-def test_a_model_that_is_wrong_inflates_the_errors(world: World) -> None:
+def test_a_model_that_is_wrong_inflates_the_errors(world):
     """A wavefront that moved more than the prior allows at frequencies that are not fitted."""
     rough = FourierModes(12.0, 7.0)
     generator = torch.Generator().manual_seed(5)
@@ -387,10 +318,7 @@ def test_a_model_that_is_wrong_inflates_the_errors(world: World) -> None:
     assert found.snr[radius(found) > 0.25].std() < 1.3
 
 
-# -- candidates ------------------------------------------------------------------------------
-
-
-def test_a_planet_is_found_where_it_is(one: Detection) -> None:
+def test_a_planet_is_found_where_it_is(one):
     assert len(one.sources) == 1
     row = one.candidates[0]
     for axis, true in zip("xy", WHERE.offset, strict=True):
@@ -403,7 +331,7 @@ def test_a_planet_is_found_where_it_is(one: Detection) -> None:
     assert row["snr"] > 8
 
 
-def test_a_candidate_has_the_signal_to_noise_of_the_map_where_it_is(world: World) -> None:
+def test_a_candidate_has_the_signal_to_noise_of_the_map_where_it_is(world):
     """Near the mask, the uncertain position adds to the error of the contrast, but not here."""
     near = dr.Planet(6e-5, 0.3, 60.0)
     found = world.detected(5, near)
@@ -413,7 +341,7 @@ def test_a_candidate_has_the_signal_to_noise_of_the_map_where_it_is(world: World
     assert found.candidates["contrast"][0] / own_error(found) < 0.95 * snr
 
 
-def test_no_candidate_is_nearer_than_the_smallest_separation(world: World) -> None:
+def test_no_candidate_is_nearer_than_the_smallest_separation(world):
     """The same S/N, by which the planet was found, counts for nothing inside it."""
     found = world.detected(5, FAINT)
     assert len(found.sources) == 1
@@ -425,9 +353,7 @@ def test_no_candidate_is_nearer_than_the_smallest_separation(world: World) -> No
 
 
 @pytest.mark.parametrize(("inner", "candidates"), [(0.695, 1), (0.72, 0)])
-def test_the_place_of_a_source_counts_and_not_that_of_its_pixel(
-    world: World, inner: float, candidates: int
-) -> None:
+def test_the_place_of_a_source_counts_and_not_that_of_its_pixel(world, inner, candidates):
     """The source is measured at 0.705 arcsec. The centre of its pixel is at 0.685."""
     found = dr.detect(world.fitted(5, FAINT), inner=inner)
     peak = np.unravel_index(np.nanargmax(found.snr), found.snr.shape)
@@ -435,20 +361,13 @@ def test_the_place_of_a_source_counts_and_not_that_of_its_pixel(
     assert len(found.candidates) == candidates
 
 
-def test_the_planet_is_gone_from_the_map_without_candidates(one: Detection) -> None:
+def test_the_planet_is_gone_from_the_map_without_candidates(one):
     near = np.hypot(one.grid[..., 0] - WHERE.offset[0], one.grid[..., 1] - WHERE.offset[1]) < 0.15
     assert one.snr[near].max() > 8
     assert np.abs(one.residual_snr[near]).max() < 3.5
 
 
-def test_measuring_at_a_pixel_gives_the_maps_value(one: Detection) -> None:
-    row, column = 27, 9
-    table = one.measure(one.grid[row, column])
-    assert float(table["contrast"][0]) == pytest.approx(one.contrast[row, column], rel=1e-3)
-    assert float(table["contrast_error"][0]) == pytest.approx(one.error[row, column], rel=1e-4)
-
-
-def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> None:
+def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world):
     """A contrast is relative to the star's light; whether there is a source at all is not."""
     fit = world.fitted(5, FAINT)
     row, scaled = (dr.measure(fit, [WHERE.offset], scatter=factor)[0] for factor in (1.0, 2.0))
@@ -462,14 +381,14 @@ def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> N
     assert scaled["contrast_error"] == pytest.approx(2 * row["contrast_error"], rel=1e-8)
 
 
-def own_error(found: Detection) -> float:
+def own_error(found):
     """The error of the first candidate's contrast without that of the calibration."""
     factor = found.error_factor.of(found.sources.offsets)
     return float(factor[0] * found.sources.errors[0, 0])
 
 
 @pytest.mark.slow
-def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large: World) -> None:
+def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large):
     """As far as wavefronts that are as probable as the one that was found change its light."""
     found = large.detected(7, replace(WHERE, contrast=8e-5))
     (linear, templates), fit = found.groups[0], found.fits[0]
@@ -494,65 +413,9 @@ def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large: W
     assert stated > 1.1 * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
 
 
-@pytest.mark.slow
-def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(world: World) -> None:
-    known = replace(world, opd=world.later)
-    found = dr.detect(known.fitted(14, replace(WHERE, contrast=9e-5), wavefront=False))
-    fit, row = found.fits[0], found.candidates[0]
-    relative = found.scatter * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
-    expected = math.hypot(relative * row["contrast"], own_error(found))
-    assert row["snr"] > 400
-    assert row["contrast_error"] == pytest.approx(expected, rel=1e-4)
-    assert row["contrast_error"] > 1.001 * own_error(found)
-    assert abs(row["contrast"] - 9e-5) < 4 * expected
-
-
-@pytest.mark.slow
-def test_errors_of_a_companion_in_the_derivatives_count_star_and_image_once(large: World) -> None:
-    found = large.detected(7, replace(WHERE, contrast=1e-3))
-    (row,) = found.candidates
-    assert len(found.fits[0].bright_companions) == 1
-    assert row["contrast_error"] == pytest.approx(own_error(found))
-    # They are in the error of the linear model, which is larger than for a source whose image and
-    # star are known.
-    distance = np.hypot(*np.moveaxis(found.grid - WHERE.offset, -1, 0))
-    known = float(found.photon_error[np.unravel_index(distance.argmin(), distance.shape)])
-    assert row["contrast_error"] > 1.2 * known
-    assert abs(row["contrast"] - 1e-3) < 4 * row["contrast_error"]
-
-
-def test_what_flux_and_image_do_to_a_contrast_may_cancel(world: World, one: Detection) -> None:
-    (linear, templates), offset = one.groups[0], torch.tensor([WHERE.offset], dtype=torch.float64)
-    flux, mode = (
-        linear.unknowns.index(Unknown("flux", 0)),
-        linear.unknowns.index(Unknown("modes", 40)),
-    )
-    seen = templates.image(0, offset[0]) * linear.frames[0].weight ** 2
-    mode_40 = 1e-9 * torch.eye(len(world.basis)).double()[40]
-    nanometre = world.basis.opd(mode_40, PupilGrid.full(world.model.npix))
-    more, less = (templates.image(0, offset[0], step * nanometre) for step in (0.5, -0.5))
-    slope = (seen * (more - less)).sum() / (seen * templates.image(0, offset[0])).sum()
-    changes = torch.zeros(len(linear.unknowns), dtype=torch.float64)
-    changes[flux], changes[mode] = 1 / one.fits[0].frames[0].values["flux"][0], slope
-    deviation = torch.full_like(linear.deviation, 1e-12)
-    deviation[[flux, mode]] = 1e-3 / changes[[flux, mode]].abs()
-
-    def error(curvature: torch.Tensor, frames: int = 1) -> float:
-        known = replace(linear, deviation=deviation, curvature=curvature)
-        groups = [(known, templates)] * frames
-        ones = torch.ones(1, dtype=torch.float64)
-        errors = calibration_errors(groups, offset, 1e3 * ones, 3 * ones)
-        return float(errors[0]) / 3
-
-    untied, tied = torch.zeros_like(linear.curvature), 1e14 * torch.outer(changes, changes)
-    assert error(untied) == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-5)
-    assert error(untied, frames=2) == pytest.approx(1e-3, rel=1e-5)
-    assert error(tied) < 1e-6
-
-
 def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_extended(
-    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    world, monkeypatch, caplog
+):
     """Two of three planets, with S/N that would be worth another fit of the star."""
     planets = [Planet(1e-5, 0.6, angle) for angle in (0.0, 120.0, 240.0)]
     fit = world.fitted(5, *planets)
@@ -565,7 +428,7 @@ def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_exte
 
 
 @pytest.mark.slow
-def test_two_planets_closer_than_a_beam_are_fitted_together(large: World) -> None:
+def test_two_planets_closer_than_a_beam_are_fitted_together(large):
     pair = (Planet(1.5e-4, 0.80, 60.0), Planet(1e-4, 0.80, 51.0))
     found = dr.detect(large.fitted(12, *pair))
     assert len(found.sources) == 2
@@ -579,20 +442,7 @@ def test_two_planets_closer_than_a_beam_are_fitted_together(large: World) -> Non
 
 
 @pytest.mark.slow
-def test_a_bright_planet_is_measured_right_after_the_star_is_refined_again(large: World) -> None:
-    planet = replace(WHERE, contrast=1e-3)
-    fit = large.fitted(13, planet, **NOT_LOOKING)
-    assert not len(fit.companions)
-    found = dr.detect(fit)
-    assert found.fits[0] is not fit
-    assert len(found.fits[0].companions) == 1
-    assert float(found.candidates["contrast"][0]) == pytest.approx(1e-3, rel=0.02)
-    away = radius(found) > 0.25
-    assert np.abs(found.residual_snr[away]).max() < 6
-
-
-@pytest.mark.slow
-def test_a_bright_ring_keeps_its_light(large: World) -> None:
+def test_a_bright_ring_keeps_its_light(large):
     """Of known shape, though no wavefront explains it; what is merely subtracted loses some."""
     angles = np.arange(0, 360, 9.0)
     places = [Planet(1.0, 0.75, angle).offset for angle in angles]
@@ -608,14 +458,14 @@ def test_a_bright_ring_keeps_its_light(large: World) -> None:
 
 
 @pytest.mark.slow
-def test_a_planet_on_the_edge_of_the_field_is_measured(large: World) -> None:
+def test_a_planet_on_the_edge_of_the_field_is_measured(large):
     planet = Planet(1e-4, 1.2, 90.0)
     table = dr.measure(large.fitted(14, planet), [planet.offset])
     assert abs(float(table["contrast"][0]) - 1e-4) < 4 * float(table["contrast_error"][0])
 
 
 @pytest.mark.slow
-def test_a_fit_that_is_gone_holds_no_memory(large: World) -> None:
+def test_a_fit_that_is_gone_holds_no_memory(large):
     """Its responses are its largest part; the collector would come for them much too late."""
     shot = large.observed(large.expected(replace(WHERE, contrast=1e-4)), 15)
     short = {"max_iterations": 6, "max_companions": 1}
@@ -634,11 +484,8 @@ def test_a_fit_that_is_gone_holds_no_memory(large: World) -> None:
     assert sum(tensor.untyped_storage().nbytes() for tensor in left) < 1e5
 
 
-# -- several frames --------------------------------------------------------------------------
-
-
 @pytest.mark.slow
-def test_independent_looks_add_their_information(world: World) -> None:
+def test_independent_looks_add_their_information(world):
     fits = [world.fitted(seed, FAINT) for seed in (5, 20, 21)]
     single = [float(dr.measure(fit, [WHERE.offset])["contrast_error"][0]) for fit in fits]
     (joint,) = dr.measure(fits, [WHERE.offset])
@@ -648,7 +495,7 @@ def test_independent_looks_add_their_information(world: World) -> None:
     assert abs(joint["contrast"] - FAINT.contrast) < 4 * joint["contrast_error"]
 
 
-def test_rolled_frames_share_the_star_and_turn_the_planet(world: World) -> None:
+def test_rolled_frames_share_the_star_and_turn_the_planet(world):
     """The sky turns with the roll, the speckles stay: a shared wavefront is known better."""
     # The same sky, at position angles that count from north: it turns back in the frame.
     turned = replace(FAINT, position_angle=50.0)
@@ -671,7 +518,7 @@ def test_rolled_frames_share_the_star_and_turn_the_planet(world: World) -> None:
     assert float(wrong["snr"][0]) < 0.6 * float(joint["snr"][0])
 
 
-def test_a_reference_star_helps_and_shows_no_planet(world: World) -> None:
+def test_a_reference_star_helps_and_shows_no_planet(world):
     target = world.observed(world.expected(FAINT), 5)
     reference = replace(world.observed(4 * world.expected(), 41), reference=True)
     fit = world.refined([target, reference])
@@ -684,7 +531,7 @@ def test_a_reference_star_helps_and_shows_no_planet(world: World) -> None:
         dr.detect(replace(fit, frames=fit.frames[::-1]))
 
 
-def test_dithered_frames_have_star_positions_of_their_own(world: World) -> None:
+def test_dithered_frames_have_star_positions_of_their_own(world):
     offsets = ((0.0, 0.0), (0.015, -0.010))
     frames = [
         world.observed(world.expected(offset=offset), 50 + k) for k, offset in enumerate(offsets)
@@ -701,19 +548,7 @@ def test_dithered_frames_have_star_positions_of_their_own(world: World) -> None:
     np.testing.assert_array_equal(first.values["lyot_shift"], second.values["lyot_shift"])
 
 
-def test_the_errors_of_frames_fitted_together_are_their_own(world: World) -> None:
-    first, second = (world.observed(world.expected(), 55 + k) for k in range(2))
-    noisy = replace(second, error=3 * second.error)
-    quiet, other = world.refined([first, noisy]).frames
-    apart = {name: noisier / quiet.errors[name] for name, noisier in other.errors.items()}
-    # Hardly anything else says what the background is; all say what the wavefront is, and with it
-    # where the star is.
-    assert apart["background"][0] == pytest.approx(2.9, abs=0.2)
-    assert (apart["star_offset"] > 1.005).all()
-    np.testing.assert_array_equal(apart["lyot_shift"], 1.0)
-
-
-def test_snapshots_may_drift_apart_by_what_the_prior_allows(world: World) -> None:
+def test_snapshots_may_drift_apart_by_what_the_prior_allows(world):
     generator = torch.Generator().manual_seed(8)
     change = torch.zeros(len(world.basis), dtype=torch.float64)
     change[:54] = 1e-9 * torch.randn(54, dtype=torch.float64, generator=generator)
@@ -721,9 +556,7 @@ def test_snapshots_may_drift_apart_by_what_the_prior_allows(world: World) -> Non
     moved = replace(world, later=world.later + drift)
     frames = [world.observed(world.expected(), 60), moved.observed(moved.expected(), 61)]
     linked = world.refined(
-        frames,
-        drift=WavefrontPrior(scales={"segment": 0.5, "texture": 0.02}),
-        drift_cycles=2.0,
+        frames, drift=WavefrontPrior(scales={"segment": 0.5, "texture": 0.02}), drift_cycles=2.0
     )
     shared = world.refined(frames)
     assert linked.chi2_per_pixel < 0.8 * shared.chi2_per_pixel
@@ -733,12 +566,7 @@ def test_snapshots_may_drift_apart_by_what_the_prior_allows(world: World) -> Non
     assert np.std(apart) > 0.2e-9
 
 
-# -- contrast --------------------------------------------------------------------------------
-
-
-def test_the_contrast_curve_is_five_times_the_error_of_the_map(
-    world: World, empty: list[Detection]
-) -> None:
+def test_the_contrast_curve_is_five_times_the_error_of_the_map(world, empty):
     table = empty[0].contrast_curve
     assert set(table.colnames) >= {"separation", "contrast", "known_star", "small_sample"}
     assert (np.diff(table["separation"].to_value("arcsec")) > 0).all()
@@ -751,17 +579,7 @@ def test_the_contrast_curve_is_five_times_the_error_of_the_map(
         assert row["contrast"] == pytest.approx(table["contrast"][k], rel=1e-6)
 
 
-def test_companions_do_not_raise_the_contrast_curve(one: Detection) -> None:
-    assert len(one.fits[0].companions) == 1
-    by_itself = dr.contrast_curve(one.fits[0], [0.5])
-    given = dr.contrast_curve(one.fits[0], [0.5], scatter=one.scatter)
-    np.testing.assert_allclose(by_itself["contrast"], given["contrast"], rtol=1e-3)
-
-
-# -- products and mistakes -------------------------------------------------------------------
-
-
-def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
+def test_products_can_be_read_by_others(one, tmp_path):
     paths = one.write(tmp_path / "products")
     assert [path.name for path in paths] == ["detection.fits", "candidates.ecsv", "contrast.ecsv"]
     with astropy_fits.open(paths[0], checksum=True) as hdus:
@@ -780,7 +598,7 @@ def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
     assert len(curve) == len(one.contrast_curve)
 
 
-def oriented(found: Detection) -> Detection:
+def oriented(found):
     """The same detection, as if it had been made in a frame of known date and orientation."""
     (fit,) = found.fits
     (frame,) = fit.frames
@@ -790,7 +608,7 @@ def oriented(found: Detection) -> Detection:
     return replace(found, fits=(replace(fit, frames=(replace(frame, observation=observation),)),))
 
 
-def test_the_images_are_on_the_sky_where_the_table_says(one: Detection, tmp_path: Path) -> None:
+def test_the_images_are_on_the_sky_where_the_table_says(one, tmp_path):
     found = oriented(one)
     planet = found.candidates[0]
     # The nearest pixel, and from there the rest of the way.
@@ -822,14 +640,12 @@ def test_the_images_are_on_the_sky_where_the_table_says(one: Detection, tmp_path
         assert "CTYPE1" not in hdus["OPD"].header
 
 
-def test_without_a_position_on_the_sky_the_coordinates_are_arcsec_from_the_star(
-    one: Detection,
-) -> None:
+def test_without_a_position_on_the_sky_the_coordinates_are_arcsec_from_the_star(one):
     wcs = WCS(world_coordinates(one.grid, one.observation))
     np.testing.assert_allclose(wcs.pixel_to_world_values(7, 3), one.grid[3, 7], atol=1e-9)
 
 
-def test_a_detection_survives_the_file(one: Detection, tmp_path: Path) -> None:
+def test_a_detection_survives_the_file(one, tmp_path):
     first = oriented(one)
     again = Detection.read(first.write(tmp_path / "first")[0].parent)
     for name in ("snr", "residual_snr", "contrast", "error", "photon_error", "grid"):
@@ -859,9 +675,7 @@ def test_a_detection_survives_the_file(one: Detection, tmp_path: Path) -> None:
         assert copy == (tmp_path / "first" / name).read_bytes()
 
 
-def test_a_detection_from_a_file_measures_with_its_fit(
-    world: World, one: Detection, tmp_path: Path
-) -> None:
+def test_a_detection_from_a_file_measures_with_its_fit(world, one, tmp_path):
     folder = one.write(tmp_path)[0].parent
     places = [[0.3, 0.6], *one.sources.offsets.tolist()]
     expected = one.measure(places)
@@ -879,24 +693,11 @@ def test_a_detection_from_a_file_measures_with_its_fit(
             np.testing.assert_array_equal(table[name], expected[name])
 
 
-@pytest.mark.parametrize("percent", [25, 50, 99])
-def test_part_of_a_file_is_no_detection(
-    empty: list[Detection], percent: int, tmp_path: Path
-) -> None:
-    path = empty[0].write(tmp_path)[0]
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    with pytest.raises(CorruptFileError, match=r"detection\.fits"):
-        Detection.read(path)
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [("FACTS", "no FACTS"), ("PHOTON_ERROR", "PHOTON_ERROR"), ("SNR", "shapes"), ("none", "such")],
 )
-def test_a_file_without_a_part_is_no_detection(
-    empty: list[Detection], name: str, message: str, tmp_path: Path
-) -> None:
+def test_a_file_without_a_part_is_no_detection(empty, name, message, tmp_path):
     path = empty[0].write(tmp_path)[0]
     if name == "none":
         path.unlink()
@@ -911,20 +712,20 @@ def test_a_file_without_a_part_is_no_detection(
         Detection.read(path)
 
 
-def test_a_refinement_is_no_detection(one: Detection, tmp_path: Path) -> None:
+def test_a_refinement_is_no_detection(one, tmp_path):
     path = one.fits[0].write(tmp_path / "fit.fits", linear=False)
     with pytest.raises(CorruptFileError, match="not a complete Detection"):
         Detection.read(path)
 
 
-def kept(image: Image, star: Image, light: Image, error: Image) -> float:
+def kept(image, star, light, error):
     """Share of a planet's light that is in a subtracted frame, and not its noise's or star's."""
     good = np.isfinite(image)
     weight = (light / error**2)[good]
     return float((weight * (image - star)[good]).sum() / (weight * light[good]).sum())
 
 
-def test_a_frame_keeps_the_light_of_candidates(world: World) -> None:
+def test_a_frame_keeps_the_light_of_candidates(world):
     light = world.expected(FAINT) - world.expected()
     found = world.detected(5, FAINT)
     assert len(found.sources) == 1
@@ -945,7 +746,7 @@ def test_a_frame_keeps_the_light_of_candidates(world: World) -> None:
     assert difference.std() < 0.2 * closed.std()
 
 
-def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world: World) -> None:
+def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world):
     """The star is found in single precision once more; of 1e-3 that must not show."""
     found = world.detected(7, replace(WHERE, contrast=1e-3))
     (fit,) = found.fits
@@ -956,58 +757,14 @@ def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world: World) -> N
     assert difference[radius(found) > 0.25].std() < 0.05
 
 
-@pytest.mark.slow
-def test_a_companion_that_one_fit_knows_is_given_to_the_others(large: World) -> None:
-    planet = replace(WHERE, contrast=7e-6)
-    shots = [large.observed(large.expected(planet), 80 + k) for k in (0, 1)]
-    fits = [
-        large.refined(shots[0], companions=(planet,), **NOT_LOOKING),
-        large.refined(shots[1], **NOT_LOOKING),
-    ]
-    assert [len(fit.companions) for fit in fits] == [1, 0]
-    found = dr.detect(fits)
-    assert [len(fit.companions) for fit in found.fits] == [1, 1]
-
-
-@pytest.mark.slow
-def test_a_companion_that_is_none_is_given_to_no_fit(large: World) -> None:
-    planet = replace(WHERE, contrast=2e-5)
-    nothing = Planet(0.0, 0.9, 250.0)
-    fit = large.refined(large.observed(large.expected(planet), 80), companions=(planet, nothing))
-    assert len(fit.companions) == 2
-    found = dr.detect(fit)
-    assert len(found.sources) == len(found.fits[0].companions) == 1
-
-
 @pytest.fixture(scope="module")
-def reference(large: World) -> Refinement:
+def reference(large):
     """A brighter star, fitted on its own."""
     return large.refined(replace(large.observed(4 * large.expected(), 72), reference=True))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, NOT_LOOKING], ids=["looking", "not looking"])
-def test_a_reference_star_on_its_own_stays_as_it_was_fitted(
-    large: World, reference: Refinement, options: dict[str, float]
-) -> None:
-    target = large.fitted(7, replace(WHERE, contrast=2e-5), **options)
-    found = dr.detect([target, reference])
-    assert len(found.fits[0].companions) == len(found.sources) == 1
-    assert found.fits[1] is reference
-    # What the fit has found by itself needs no second one.
-    assert [len(target.companions), found.fits[0] is target] == [int(not options), not options]
-
-
-def test_without_candidates_a_frame_is_left_as_the_fit_left_it(empty: list[Detection]) -> None:
-    fit = empty[0].fits[0]
-    difference = (empty[0].subtracted[0] - fit.frames[0].residual[0]) / fit.frames[
-        0
-    ].observation.error[0]
-    assert difference.std() < 0.05
-
-
-@pytest.mark.slow
-def test_every_frame_is_subtracted_as_it_was_taken(large: World) -> None:
+def test_every_frame_is_subtracted_as_it_was_taken(large):
     """A roll, a masked pixel and a reference star, refined together."""
     planets = [Planet(2e-5, 0.7, 60.0 - turned) for turned in (0.0, 90.0)]
     frames = [
@@ -1029,33 +786,15 @@ def test_every_frame_is_subtracted_as_it_was_taken(large: World) -> None:
     np.testing.assert_allclose(apart.subtracted[1], apart.fits[1].frames[0].residual[0], atol=1e-9)
 
 
-def test_a_fit_without_a_linear_model_is_refused(world: World) -> None:
-    with pytest.raises(IncompatibleSetupError, match=r"linear=False.*Fit the frames again"):
-        dr.detect(replace(world.fitted(0), stored_linear=None))
-
-
-def test_no_fit_and_odd_positions_are_refused(one: Detection) -> None:
-    with pytest.raises(IncompatibleSetupError, match="no fit"):
-        dr.detect([])
-    with pytest.raises(ShapeError, match=r"\(k, 2\)"):
-        one.measure([0.1, 0.2, 0.3])
-    with pytest.raises(NonFiniteError, match="offsets"):
-        one.measure([[np.nan, 0.2]])
-
-
-def test_positions_may_have_a_unit(one: Detection) -> None:
+def test_positions_may_have_a_unit(one):
     plain = one.measure([[-0.485, 0.353]])
     for offsets in ([[-485, 353]] * u.mas, [[-0.485, 0.353]] * u.arcsec):
         for table in (one.measure(offsets), dr.measure(one.fits, offsets, scatter=one.scatter)):
             for name in plain.colnames:
                 np.testing.assert_allclose(table[name], plain[name], rtol=1e-12)
-    with pytest.raises(UnitError, match="offsets"):
-        one.measure([[1.0, 2.0]] * u.m)
-    with pytest.raises(UnitError, match="inner"):
-        dr.detect(one.fits, inner=1 * u.m)
 
 
-def test_a_position_outside_the_field_is_refused(one: Detection) -> None:
+def test_a_position_outside_the_field_is_refused(one):
     """Such as one that somebody else calls arcsec, and means degrees or pixels."""
     corner = one.grid[0, 0]
     assert np.isfinite(one.measure([corner])["contrast"][0])
@@ -1066,22 +805,39 @@ def test_a_position_outside_the_field_is_refused(one: Detection) -> None:
             dr.measure(one.fits, far)
 
 
+REFUSED = [
+    (lambda one: dr.detect([]), "no fit"),
+    (lambda one: dr.detect(replace(one.fits[0], stored_linear=None)), "linear=False.*Fit the fra"),
+    (lambda one: one.measure([0.1, 0.2, 0.3]), r"\(k, 2\)"),
+    (lambda one: one.measure([[np.nan, 0.2]]), "offsets"),
+    (lambda one: one.measure([[1.0, 2.0]] * u.m), "offsets"),
+    (lambda one: dr.detect(one.fits, inner=1 * u.m), "inner"),
+]
+CALLS = {
+    "threshold: got": lambda fit, value: dr.detect(fit, threshold=value),
+    "inner: got": lambda fit, value: dr.detect(fit, inner=value),
+    "scatter: got": lambda fit, value: dr.detect(fit, scatter=value),
+    "separations: got": lambda fit, value: dr.detect(fit, separations=[0.5, value]),
+    "separations: got ": lambda fit, value: dr.contrast_curve(fit, [value]),
+    "scatter: got ": lambda fit, value: dr.contrast_curve(fit, [0.5], scatter=value),
+    "scatter: got.": lambda fit, value: dr.measure(fit, [[0.5, 0.5]], scatter=value),
+}
+
+
+@pytest.mark.parametrize(("call", "words"), REFUSED)
+def test_what_cannot_be_searched_or_measured_is_refused(one, call, words):
+    with pytest.raises(DiffrenderError, match=words):
+        call(one)
+
+
 @pytest.mark.parametrize("value", [-1.0, 0.0, math.nan])
-def test_numbers_that_cannot_be_are_refused(one: Detection, value: float) -> None:
-    fit = one.fits[0]
-    for name in ("threshold", "inner", "scatter"):
-        with pytest.raises(IncompatibleSetupError, match=f"{name}: got .*positive"):
-            dr.detect(fit, **{name: value})
-    with pytest.raises(IncompatibleSetupError, match=r"separations: got .*positive"):
-        dr.detect(fit, separations=[0.5, value])
-    with pytest.raises(IncompatibleSetupError, match=r"separations: got .*positive"):
-        dr.contrast_curve(fit, [value])
-    for call in (dr.contrast_curve, dr.measure):
-        with pytest.raises(IncompatibleSetupError, match=r"scatter: got .*positive"):
-            call(fit, [[0.5, 0.5]], scatter=value)
+@pytest.mark.parametrize("words", CALLS)
+def test_numbers_that_cannot_be_are_refused(one, words, value):
+    with pytest.raises(IncompatibleSetupError, match=f"{words}.*positive"):
+        CALLS[words](one.fits[0], value)
 
 
-def test_a_contrast_curve_outside_the_field_is_refused(one: Detection) -> None:
+def test_a_contrast_curve_outside_the_field_is_refused(one):
     fit = one.fits[0]
     with pytest.raises(IncompatibleSetupError, match=r"separations: got \[5\.0, 6\.0\].*corners"):
         dr.contrast_curve(fit, [5.0, 6.0])
@@ -1091,7 +847,7 @@ def test_a_contrast_curve_outside_the_field_is_refused(one: Detection) -> None:
 
 
 @pytest.mark.slow
-def test_all_errors_have_the_factor_of_their_position(empty: list[Detection]) -> None:
+def test_all_errors_have_the_factor_of_their_position(empty):
     """A fit that does not explain its data is searched with the scatter of its S/N."""
     (fit,) = empty[0].fits
     # Residuals, and unknowns as far from their priors, three times what they should be.

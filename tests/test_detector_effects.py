@@ -7,7 +7,6 @@ import pytest
 import scipy.ndimage
 import torch
 from astropy.convolution import convolve
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from pyklip_diffrender.bridges.sampled_planes import SplineRotation
@@ -15,41 +14,38 @@ from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.optics import (
     ChainDetector,
     Detector,
-    Effect,
     GaussianBlur,
     LinearResampling,
     PixelCrosstalk,
 )
-
-Array = NDArray[np.float64]
 
 SHAPE = (24, 31)
 KERNEL = np.array([[0.01, 0.02, 0.03], [0.04, 0.8, 0.05], [0.06, 0.07, 0.08]])
 
 
 @pytest.fixture
-def image(rng: np.random.Generator) -> Array:
+def image(rng):
     return rng.uniform(size=SHAPE)
 
 
-def apply(effect: Effect, image: Array) -> Array:
+def apply(effect, image):
     return effect(torch.from_numpy(image)).numpy()
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.124, 0.126, 0.4, 1.15, 3.0, 12.0])
-def test_blur_is_that_of_scipy(image: Array, sigma: float) -> None:
+def test_blur_is_that_of_scipy(image, sigma):
     truth = scipy.ndimage.gaussian_filter(image, sigma)
     assert np.abs(apply(GaussianBlur(sigma), image) - truth).max() < 1e-13
     assert np.array_equal(truth, image) == (sigma < 0.125)
 
 
 @pytest.mark.parametrize("angle", [0.0776, -0.5, 12.3, 90.0, 200.0])
-def test_rotation_is_that_of_scipy(image: Array, angle: float) -> None:
+def test_rotation_is_that_of_scipy(image, angle):
     truth = scipy.ndimage.rotate(image, angle, reshape=False)
     assert np.abs(apply(SplineRotation(angle, SHAPE), image) - truth).max() < 1e-12
 
 
-def test_rotation_takes_complex_fields(image: Array) -> None:
+def test_rotation_takes_complex_fields(image):
     rotation = SplineRotation(7.0, SHAPE)
     field = torch.from_numpy(image + 1j * image[::-1])
     parts = torch.complex(rotation(field.real.contiguous()), rotation(field.imag.contiguous()))
@@ -57,7 +53,7 @@ def test_rotation_takes_complex_fields(image: Array) -> None:
     assert rotation(field.to(torch.complex64)).dtype == torch.complex64
 
 
-def test_resampling_is_that_of_scipy(image: Array, rng: np.random.Generator) -> None:
+def test_resampling_is_that_of_scipy(image, rng):
     rows = rng.uniform(-2, SHAPE[0] + 1, size=(17, 19))
     columns = rng.uniform(-2, SHAPE[1] + 1, size=(17, 19))
     rows[0, :3], columns[0, :3] = (0, SHAPE[0] - 1, 5), (0, SHAPE[1] - 1, 7)
@@ -69,7 +65,7 @@ def test_resampling_is_that_of_scipy(image: Array, rng: np.random.Generator) -> 
         LinearResampling(rows, columns, (8, 8))(torch.from_numpy(image))
 
 
-def test_crosstalk_is_that_of_astropy(image: Array) -> None:
+def test_crosstalk_is_that_of_astropy(image):
     truth = convolve(image, KERNEL, boundary="fill", fill_value=0)
     assert np.abs(apply(PixelCrosstalk(KERNEL), image) - truth).max() < 1e-14
     # What the kernel has to the right of its middle goes to the right.
@@ -80,7 +76,7 @@ def test_crosstalk_is_that_of_astropy(image: Array) -> None:
         PixelCrosstalk(np.ones((2, 3)))
 
 
-def effects() -> dict[str, Effect]:
+def effects():
     y, x = np.mgrid[:9, :11] * 0.93
     return {
         "blur": GaussianBlur(0.7),
@@ -91,7 +87,7 @@ def effects() -> dict[str, Effect]:
 
 
 @pytest.mark.parametrize("name", effects())
-def test_adjoints(name: str) -> None:
+def test_adjoints(name):
     """<A u, v> = <u, A* v>, where autograd gives A*."""
     effect, generator = effects()[name], torch.manual_seed(3)
     u = torch.randn(9, 11, dtype=torch.float64, generator=generator).requires_grad_()
@@ -103,13 +99,13 @@ def test_adjoints(name: str) -> None:
     assert torch.allclose(effect(torch.stack([u, 2 * u]))[1], 2 * image, atol=1e-14)
 
 
-def test_the_width_of_the_blur_can_be_fitted() -> None:
+def test_the_width_of_the_blur_can_be_fitted():
     image = torch.rand(7, 8, dtype=torch.float64, generator=torch.manual_seed(4))
     sigma = torch.tensor(0.83, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda s: GaussianBlur(s)(image), (sigma,), eps=1e-6)
 
 
-def test_a_chain_bins_between_samples_and_pixels(rng: np.random.Generator) -> None:
+def test_a_chain_bins_between_samples_and_pixels(rng):
     shape, oversample = (6, 8), 3
     fine = rng.uniform(size=(18, 24))
     blur, crosstalk = GaussianBlur(1.3), PixelCrosstalk(KERNEL)

@@ -4,37 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from astropy.io import fits
-from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift, gaussian_filter
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.errors import (
-    IncompatibleSetupError,
-    NonFiniteError,
-    ShapeError,
-)
-from pyklip_diffrender.optics import PointSources
-from pyklip_diffrender.pattern import (
-    MeasuredPattern,
-    combine_patterns,
-    place_on_detector,
-)
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.pattern import MeasuredPattern, combine_patterns, place_on_detector
 from pyklip_diffrender.scene.star_place import measured_offset
 
 SIDE = 320
 SHIFTS = np.array([[10.6, -13.3], [10.4, -13.4]])
-MASK = np.array([149.2 + 0.177, 173.6 - 0.205])
-"""Centre of MASK335R on the subarray in F444W, 0-indexed."""
 
 
-def on_detector() -> NDArray[np.float64]:
+def on_detector():
     """A smooth scene on the detector, with the pixel-scale pattern of a flat field."""
     rng = np.random.default_rng(1)
     smooth = gaussian_filter(rng.normal(size=(SIDE, SIDE)), 2, mode="wrap")
@@ -42,7 +27,7 @@ def on_detector() -> NDArray[np.float64]:
     return np.asarray(100 * (2 + smooth / smooth.std()) * flat)
 
 
-def aligned_file(path: Path, shifts: NDArray[np.float64] = SHIFTS, **cards: object) -> Path:
+def aligned_file(path, shifts=SHIFTS, **cards):
     """Two frames as an alignment leaves them: star at (160, 160), cut so that it is at (150, 174).
 
     The scene is shifted with the Fourier transform; DQ stays where it was.
@@ -74,7 +59,7 @@ def aligned_file(path: Path, shifts: NDArray[np.float64] = SHIFTS, **cards: obje
     return path
 
 
-def test_the_shift_of_aligned_frames_is_undone(tmp_path: Path) -> None:
+def test_the_shift_of_aligned_frames_is_undone(tmp_path):
     observation = dr.Observation.from_fits(aligned_file(tmp_path / "aligned.fits"))
     assert observation.first_pixel is not None
     x, y = np.subtract(observation.first_pixel, (491, 1501))
@@ -93,15 +78,7 @@ def test_the_shift_of_aligned_frames_is_undone(tmp_path: Path) -> None:
     assert cut.first_pixel == (491 + 110, 1500 + 135)
 
 
-def test_shifts_that_do_not_fit_the_frames_are_refused(tmp_path: Path) -> None:
-    path = aligned_file(tmp_path / "one.fits")
-    with fits.open(path, mode="update") as hdus:
-        hdus["IMSHIFTS"].data = SHIFTS[:1]
-    with pytest.raises(ShapeError, match=r"IMSHIFTS: got shape \(1, 2\), expected \(2, 2\)"):
-        dr.Observation.from_fits(path)
-
-
-def test_shifts_of_newer_spaceklip_releases_are_undone(tmp_path: Path) -> None:
+def test_shifts_of_newer_spaceklip_releases_are_undone(tmp_path):
     """The same frames, with the shift recorded in two parts."""
     old, new = aligned_file(tmp_path / "old.fits"), aligned_file(tmp_path / "new.fits")
     center = np.tile(SHIFTS[0] + 0.2, (2, 1))
@@ -116,20 +93,7 @@ def test_shifts_of_newer_spaceklip_releases_are_undone(tmp_path: Path) -> None:
     assert observation.first_pixel == expected.first_pixel
 
 
-@pytest.mark.parametrize("wrong", [np.zeros((1, 2)), np.zeros(3), np.full((2, 2), np.nan)])
-def test_shifts_of_newer_releases_that_make_no_sense_are_refused(
-    tmp_path: Path, wrong: NDArray[np.float64]
-) -> None:
-    path = aligned_file(tmp_path / "wrong.fits")
-    with fits.open(path, mode="update") as hdus:
-        del hdus["IMSHIFTS"]
-        hdus.append(fits.ImageHDU(SHIFTS, name="CENTER_SHIFT"))
-        hdus.append(fits.ImageHDU(wrong, name="ALIGN_SHIFT"))
-    with pytest.raises((ShapeError, NonFiniteError), match="ALIGN_SHIFT"):
-        dr.Observation.from_fits(path)
-
-
-def test_shifts_that_were_not_applied_yet_are_not_undone(tmp_path: Path) -> None:
+def test_shifts_that_were_not_applied_yet_are_not_undone(tmp_path):
     path = aligned_file(tmp_path / "centers.fits")
     star = np.array([140.3, 187.6])
     with fits.open(path, mode="update") as hdus:
@@ -144,7 +108,7 @@ def test_shifts_that_were_not_applied_yet_are_not_undone(tmp_path: Path) -> None
     assert observation.first_pixel == (491, 1501)
 
 
-def test_plain_calints_know_their_pixels(tmp_path: Path) -> None:
+def test_plain_calints_know_their_pixels(tmp_path):
     path = aligned_file(tmp_path / "plain.fits")
     with fits.open(path, mode="update") as hdus:
         del hdus["IMSHIFTS"]
@@ -156,7 +120,7 @@ def test_plain_calints_know_their_pixels(tmp_path: Path) -> None:
     assert dr.Observation.from_fits(path).first_pixel is None
 
 
-def test_a_gap_does_not_spread_when_a_shift_is_undone(tmp_path: Path) -> None:
+def test_a_gap_does_not_spread_when_a_shift_is_undone(tmp_path):
     """A hole at the star's peak in SCI or ERR: neighbours keep values and errors, or are masked."""
     y, x = np.indices((SIDE, SIDE))
     star = 3000 * np.exp(-((x - 150) ** 2 + (y - 174) ** 2) / (2 * 1.1**2))
@@ -202,11 +166,8 @@ def test_a_gap_does_not_spread_when_a_shift_is_undone(tmp_path: Path) -> None:
         ({"CORONMSK": None, "APERNAME": None}, False),
     ],
 )
-def test_the_place_of_shifted_frames_is_known_or_left_to_the_search(
-    tmp_path: Path, cards: dict[str, object], place: bool
-) -> None:
+def test_the_place_of_shifted_frames_is_known_or_left_to_the_search(tmp_path, cards, place):
     path = aligned_file(tmp_path / "a.fits")
-    expected = dr.Observation.from_fits(path)
     with fits.open(path, mode="update") as hdus:
         for key, value in cards.items():
             if value is None:
@@ -217,22 +178,12 @@ def test_the_place_of_shifted_frames_is_known_or_left_to_the_search(
     if not place:
         assert got.first_pixel is None
         return
-    assert got.first_pixel is not None
-    assert expected.first_pixel is not None
-    # The star is on the same place of the detector.
-    np.testing.assert_allclose(
-        got.center + got.first_pixel, expected.center + expected.first_pixel, atol=1e-6
-    )
+    # The star is on the same place of the detector as in the first test.
+    expected = np.add([[149.4, 174.3], [149.6, 174.4]], (491, 1500))
+    np.testing.assert_allclose(got.center + got.first_pixel, expected, atol=1e-6)
 
 
-def test_a_subarray_that_begins_elsewhere_is_not_believed(tmp_path: Path) -> None:
-    path = aligned_file(tmp_path / "plain.fits", SUBSTRT1=1, SUBSTRT2=1, SUBARRAY="FULL")
-    with fits.open(path, mode="update") as hdus:
-        del hdus["IMSHIFTS"]
-    assert dr.Observation.from_fits(path).first_pixel is None
-
-
-def measured(star: str, first: tuple[int, int] = (600, 1630), **changes: object) -> MeasuredPattern:
+def measured(star, first=(600, 1630), **changes):
     rng = np.random.default_rng(5)
     truth = 0.05 * rng.normal(size=(60, 60))
     noise = np.random.default_rng(len(star)).normal(size=truth.shape)
@@ -251,7 +202,7 @@ def measured(star: str, first: tuple[int, int] = (600, 1630), **changes: object)
     return replace(pattern, **changes)
 
 
-def test_patterns_are_combined_pixel_by_pixel_of_the_detector() -> None:
+def test_patterns_are_combined_pixel_by_pixel_of_the_detector():
     one, other = measured("A"), measured("BB", (602, 1629))
     known = combine_patterns([one, other])
     assert known.first_pixel == (600, 1629)
@@ -266,11 +217,10 @@ def test_patterns_are_combined_pixel_by_pixel_of_the_detector() -> None:
 
 
 @pytest.mark.parametrize("name", ["F444W", "F356W"])
-def test_the_library_knows_other_stars_on_the_same_pixels(tmp_path: Path, name: str) -> None:
+def test_the_library_knows_other_stars_on_the_same_pixels(tmp_path, name):
     frames = dr.Observation.from_fits(aligned_file(tmp_path / "a.fits", FILTER=name))
     cut = frames.cutout(80)
     known = dr.known_systematics(cut)
-    assert known is not None
     assert known.filter == name
     assert known.provenance["stars"] == ["HIP17695", "G-7-34"]
     pattern, error = known.at(cut)
@@ -281,11 +231,10 @@ def test_the_library_knows_other_stars_on_the_same_pixels(tmp_path: Path, name: 
     assert np.median(error[near]) < 0.5 * pattern[near].std()
 
 
-def test_the_library_leaves_out_the_target_and_what_it_does_not_cover(tmp_path: Path) -> None:
+def test_the_library_leaves_out_the_target_and_what_it_does_not_cover(tmp_path):
     frames = dr.Observation.from_fits(aligned_file(tmp_path / "a.fits")).cutout(80)
     frames.header["TARGPROP"] = "HIP 17695"
     known = dr.known_systematics(frames)
-    assert known is not None
     assert known.provenance["stars"] == ["G-7-34"]
     frames.header["TARGPROP"] = "A STAR"
     assert dr.known_systematics(frames, library=False) is None
@@ -295,52 +244,13 @@ def test_the_library_leaves_out_the_target_and_what_it_does_not_cover(tmp_path: 
     assert dr.known_systematics(frames) is None
 
 
-# -- images of sources off the pixels' centres -----------------------------------------------------
-
-
 @cache
-def system() -> dr.OpticalSystem:
+def system():
     return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
 
 
-def test_sources_off_the_pixels_centres_are_those_of_the_model() -> None:
-    offset = (0.011, -0.02)
-    sources = PointSources(system(), None, {"detector_shift": (0.02, -0.01)}, offset=offset)
-    assert sources.route == "lattice"
-    rows, columns = [4, 20, 27], [9, 22, 3]
-    places = sources.positions(rows, columns)
-    exact = system()(None, places, detector_shift=(0.02, -0.01))
-    images = sources.images(rows, columns).double()
-    assert float((images - exact).norm() / exact.norm()) < 1e-4
-    centred = PointSources(system(), None, {"detector_shift": (0.02, -0.01)})
-    np.testing.assert_allclose(places - centred.positions(rows, columns), [offset] * 3, atol=1e-12)
-
-
-def test_templates_of_rolled_frames_stand_where_the_planet_is() -> None:
-    opd = dr.random_opd(1, npix=128)
-    frames = [
-        replace(dr.simulate(system(), dr.Scene(), opd, seed=seed), position_angles=np.array([roll]))
-        for seed, roll in ((1, 0.0), (2, 10.0))
-    ]
-    fit = dr.refine(system(), frames, opd, settings=dr.GaussNewton(cycles=4))
-    templates = Templates(fit, fit.frames[0])
-    rows, columns = np.array([6, 16, 25]), np.array([16, 28, 8])
-    images = templates.at_pixels(rows, columns)
-    exact = templates.at(torch.from_numpy(templates.grid[rows, columns]))
-    for k, least in ((0, 0.9999), (1, 0.985)):
-        one, other = images[k].double().flatten(1), exact[k].flatten(1)
-        overlap = (one * other).sum(1) / (one.norm(dim=1) * other.norm(dim=1))
-        assert float(overlap.min()) > least
-    # Outside the second frame there is no light.
-    corner = templates.at_pixels(np.array([31]), np.array([31]))
-    assert float(corner[1].abs().max()) == 0 < float(corner[0].max())
-
-
-# -- frames that do not say where they are ---------------------------------------------------------
-
-
 @pytest.mark.parametrize("moved", [(0.3, 1.2), None], ids=["seen", "not there"])
-def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None) -> None:
+def test_lost_pixels_are_found_by_the_pattern(moved):
     rng = np.random.default_rng(8)
     flat = 0.06 * rng.normal(size=(38, 38))
     opd = dr.random_opd(1, npix=128)
@@ -372,7 +282,6 @@ def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None)
     if moved is None:
         assert frame is None
         return
-    assert frame is not None
     assert frame.first_pixel == (103 - 0, 203 - 1)
     np.testing.assert_allclose(frame.center - observation.center, [[-0.3, -0.2]], atol=0.11)
     assert not frame.valid[~valid].any()
@@ -382,29 +291,8 @@ def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None)
         assert frame.data[0, row, column] == pytest.approx(onto[row, column], rel=0.08)
 
 
-def test_the_prior_of_the_pattern_does_not_hang_on_the_stated_noise() -> None:
-    """A pattern of 2 % in frames whose noise is 5 % and said to be 6 %."""
-    rng = np.random.default_rng(11)
-    truth = 0.02 * rng.normal(size=(120, 120))
-    frames = [
-        MeasuredPattern(
-            "A",
-            truth + 0.05 * rng.normal(size=truth.shape),
-            np.full(truth.shape, 0.06**2),
-            (59.5, 59.5),
-            (600, 1600),
-            "F444W",
-        )
-        for _ in range(2)
-    ]
-    known = combine_patterns(frames)
-    slope = (known.pattern * truth).sum() / (truth**2).sum()
-    # 0.02^2 / (0.02^2 + 0.05^2 / 2): from squares it would be 0.6, from squares less noise 0.05.
-    assert slope == pytest.approx(0.24, abs=0.04)
-
-
 @pytest.mark.parametrize("x", [-0.4, 0.0, 0.3, 1.7])
-def test_a_star_is_measured_to_a_tenth_of_a_pixel(x: float) -> None:
+def test_a_star_is_measured_to_a_tenth_of_a_pixel(x):
     """About a stated position between the pixels."""
     columns, rows = np.meshgrid(np.arange(101.0), np.arange(101.0))
     stated = np.array([50.3, 49.6])

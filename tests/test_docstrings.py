@@ -17,7 +17,7 @@ NAMES = sorted(
 )
 
 
-def takes_long(name: str) -> bool:
+def takes_long(name):
     """Whether the examples of a name fit, which takes seconds."""
     text = inspect.getdoc(getattr(dr, name)) or ""
     return any(
@@ -25,7 +25,7 @@ def takes_long(name: str) -> bool:
     )
 
 
-def test_public_names_have_examples() -> None:
+def test_public_names_have_examples():
     without = {name for name in NAMES if ">>>" not in (inspect.getdoc(getattr(dr, name)) or "")}
     assert not without
 
@@ -34,7 +34,7 @@ def test_public_names_have_examples() -> None:
     "name",
     [pytest.param(name, marks=pytest.mark.slow) if takes_long(name) else name for name in NAMES],
 )
-def test_examples_give_what_they_say(name: str) -> None:
+def test_examples_give_what_they_say(name):
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     # Without the names of the module: a reader does not have them.
     for each in doctest.DocTestFinder().find(getattr(dr, name), name, globs={}):

@@ -8,8 +8,6 @@ moved.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import poppy
@@ -57,7 +55,7 @@ class World:
     flux: float
     seen: Array
 
-    def observed(self, seed: int) -> Observation:
+    def observed(self, seed):
         """A frame with photon and read noise."""
         rng = np.random.default_rng(seed)
         expected = self.flux * (self.star + self.planet.contrast * self.light)
@@ -65,12 +63,12 @@ class World:
         error = np.sqrt(np.maximum(data, 0) + READ_NOISE**2)
         return Observation.from_arrays(data, error, pixelscale=self.model.detector.pixelscale)
 
-    def error_of(self, star: Array) -> float:
+    def error_of(self, star):
         """Rms of a star model's error over the noise."""
         truth = self.flux * self.star
         return float(np.sqrt(np.mean((star - truth) ** 2 / (truth + READ_NOISE**2))))
 
-    def unseen_rms(self, opd: Array) -> float:
+    def unseen_rms(self, opd):
         """Rms of a wavefront's error behind the stop, piston and tilt apart, m."""
         y, x = np.nonzero(self.seen)
         design = np.stack([np.ones(len(x)), x, y], axis=1)
@@ -78,7 +76,7 @@ class World:
         return float(np.std(away - design @ np.linalg.lstsq(design, away, rcond=None)[0]))
 
 
-def check(world: World, settings: GaussNewton, seed: int = 5) -> None:
+def check(world, settings, seed=5):
     """The drift is recovered, and the planet measured."""
     fit = dr.refine(world.model, world.observed(seed), world.before, settings=settings)
     assert fit.status is Status.CONVERGED
@@ -95,10 +93,7 @@ def check(world: World, settings: GaussNewton, seed: int = 5) -> None:
         assert abs(row[axis].value - true) < 3 * row[f"{axis}_error"].value
 
 
-# -- stpsf ---------------------------------------------------------------------------------------
-
-
-def nircam(folder: Path, npix: int, opd: fits.HDUList | None = None, **options: Any) -> Any:
+def nircam(folder, npix, opd=None, **options):
     import stpsf
 
     instrument = stpsf.NIRCam()
@@ -112,7 +107,7 @@ def nircam(folder: Path, npix: int, opd: fits.HDUList | None = None, **options: 
 
 
 @pytest.mark.slow
-def test_a_frame_made_by_stpsf(stpsf_path: Path) -> None:
+def test_a_frame_made_by_stpsf(stpsf_path):
     """NIRCam's round mask after the telescope has drifted by 10 nm, with all of the detector.
 
     That conversions agree on STScI's own files at 1024 samples is shown in test_parity_stpsf.py.
@@ -134,9 +129,7 @@ def test_a_frame_made_by_stpsf(stpsf_path: Path) -> None:
         for options in ({}, offset)
     )
     model = from_webbpsf(nircam(stpsf_path, npix), add_distortion=True, **call)
-    assert model.entrance.opd is not None
     later = from_webbpsf(nircam(stpsf_path, npix, drifted), **call).entrance.opd
-    assert later is not None
     stop = polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy() > 0.5
     world = World(
         model, model.entrance.opd.numpy(), later.numpy(), star, light, planet, 3e10,
@@ -145,14 +138,10 @@ def test_a_frame_made_by_stpsf(stpsf_path: Path) -> None:
     check(world, GaussNewton(cycles=8.0, response_npix=64), seed=8)
 
 
-# -- poppy ---------------------------------------------------------------------------------------
-
 DIAMETER = 2.4
 
 
-def coronagraph(
-    opd: Array, planet: Planet | None = None, *, pixels: int, oversample: int
-) -> poppy.OpticalSystem:
+def coronagraph(opd, planet=None, *, pixels, oversample):
     """A telescope of 2.4 m with one strut, a hard-edged spot and a ring-shaped stop."""
     npix = len(opd)
     y, x = (np.mgrid[:npix, :npix] - (npix - 1) / 2) * DIAMETER / npix
@@ -160,10 +149,7 @@ def coronagraph(
     strut = (np.abs(x - 0.1) < 0.03) & (y > 0)
     system = poppy.OpticalSystem(oversample=oversample, npix=npix, verbose=False)
     system.pupil_diameter = DIAMETER * u.m
-    sampling = {
-        "pixelscale": DIAMETER / npix * u.m / u.pixel,
-        "planetype": PlaneType.pupil,
-    }
+    sampling = {"pixelscale": DIAMETER / npix * u.m / u.pixel, "planetype": PlaneType.pupil}
     primary = (radius < 0.5 * DIAMETER) & (radius > 0.18 * DIAMETER) & ~strut
     system.add_pupil(
         poppy.ArrayOpticalElement(
@@ -181,7 +167,7 @@ def coronagraph(
     return system
 
 
-def stop_of(npix: int) -> NDArray[np.bool_]:
+def stop_of(npix):
     y, x = (np.mgrid[:npix, :npix] - (npix - 1) / 2) / npix
     return (np.hypot(x, y) < 0.42) & (np.hypot(x, y) > 0.24)
 
@@ -193,9 +179,7 @@ def stop_of(npix: int) -> NDArray[np.bool_]:
         pytest.param(128, 36, 2, (1.55e-6, 1.65e-6), 6.0, marks=pytest.mark.slow),
     ],
 )
-def test_a_frame_made_by_poppy(
-    npix: int, pixels: int, oversample: int, waves: tuple[float, ...], cycles: float
-) -> None:
+def test_a_frame_made_by_poppy(npix, pixels, oversample, waves, cycles):
     """Somebody's own coronagraph, whose modes are not those of JWST's segments."""
     before = lopsided(npix, 1, 30e-9)
     # A part of a map has lower frequencies across the pupil than the whole.
@@ -204,7 +188,7 @@ def test_a_frame_made_by_poppy(
     weights = [1.0, 2.0][: len(waves)]
     shape = {"pixels": pixels, "oversample": oversample}
 
-    def image(source: Planet | None) -> Array:
+    def image(source):
         hdus = coronagraph(later, source, **shape).calc_psf(list(waves) * u.m, weight=weights)
         samples = hdus[0].data.reshape(pixels, oversample, pixels, oversample)
         return np.asarray(samples.sum(axis=(1, 3)), dtype=float)
@@ -217,7 +201,7 @@ def test_a_frame_made_by_poppy(
 
 
 @pytest.mark.parametrize("radius", [1.2, 4.0])
-def test_the_segments_of_jwst_are_no_modes_of_another_telescope(radius: float) -> None:
+def test_the_segments_of_jwst_are_no_modes_of_another_telescope(radius):
     """Neither of a smaller one nor of one in which JWST would have a place."""
     osys = poppy.OpticalSystem(oversample=1, npix=64)
     osys.add_pupil(poppy.CircularAperture(radius=radius, pad_factor=1.0))

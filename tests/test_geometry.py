@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,13 +20,13 @@ from pyklip_diffrender.optics import (
 )
 
 
-def area(polygon: torch.Tensor) -> float:
+def area(polygon):
     x, y = polygon.T
     return 0.5 * abs(float((x * y.roll(-1) - y * x.roll(-1)).sum()))
 
 
 @pytest.mark.parametrize("npix", [7, 32, 101, 1024])
-def test_coverage_has_the_exact_area(npix: int) -> None:
+def test_coverage_has_the_exact_area(npix):
     grid = PupilGrid.full(npix)
     coverage = polygon_coverage(maskrnd_openings(), grid)
     expected = sum(area(polygon) for polygon in maskrnd_openings())
@@ -37,14 +36,7 @@ def test_coverage_has_the_exact_area(npix: int) -> None:
     assert coverage.max() <= 1 + 1e-12
 
 
-def test_coverage_does_not_depend_on_the_sense_of_rotation() -> None:
-    grid = PupilGrid.full(40)
-    forward = polygon_coverage(maskrnd_openings(), grid)
-    backward = polygon_coverage([p.flip(0) for p in maskrnd_openings()], grid)
-    torch.testing.assert_close(forward, backward, rtol=0, atol=1e-12)
-
-
-def test_coverage_of_a_known_triangle() -> None:
+def test_coverage_of_a_known_triangle():
     # Pixels of side 1 from -2 to 2; the triangle (-1, -1), (1, -1), (-1, 1) halves two of four.
     grid = PupilGrid.full(4, 4.0)
     triangle = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64)
@@ -53,7 +45,7 @@ def test_coverage_of_a_known_triangle() -> None:
     torch.testing.assert_close(polygon_coverage([triangle], grid), expected)
 
 
-def test_coverage_in_a_window_is_the_window_of_the_coverage() -> None:
+def test_coverage_in_a_window_is_the_window_of_the_coverage():
     full = PupilGrid.full(90)
     window = PupilGrid(90, JWST_DIAMETER, (20, 71), (33, 80))
     whole = polygon_coverage(maskrnd_openings(), full)
@@ -62,11 +54,11 @@ def test_coverage_in_a_window_is_the_window_of_the_coverage() -> None:
     )
 
 
-def test_coverage_is_differentiable_in_shift_and_rotation() -> None:
+def test_coverage_is_differentiable_in_shift_and_rotation():
     generator = torch.Generator().manual_seed(3)
     weight = torch.rand(30, 30, dtype=torch.float64, generator=generator)
 
-    def total(shift: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+    def total(shift, rotation):
         moved = transform_polygons(maskrnd_openings(), shift, rotation)
         return (weight * polygon_coverage(moved, PupilGrid.full(30))).sum()
 
@@ -75,7 +67,7 @@ def test_coverage_is_differentiable_in_shift_and_rotation() -> None:
     assert torch.autograd.gradcheck(total, (shift, rotation), eps=1e-7, atol=1e-6)
 
 
-def test_a_shift_by_whole_pixels_moves_the_array_to_plus_x_and_plus_y() -> None:
+def test_a_shift_by_whole_pixels_moves_the_array_to_plus_x_and_plus_y():
     grid = PupilGrid.full(128)
     still = polygon_coverage(maskrnd_openings(), grid)
     shift = torch.tensor([2.0, 3.0], dtype=torch.float64) * grid.spacing
@@ -85,14 +77,14 @@ def test_a_shift_by_whole_pixels_moves_the_array_to_plus_x_and_plus_y() -> None:
     torch.testing.assert_close(moved, still.roll((3, 2), dims=(0, 1)), rtol=0, atol=1e-10)
 
 
-def test_a_positive_rotation_turns_plus_x_towards_plus_y() -> None:
+def test_a_positive_rotation_turns_plus_x_towards_plus_y():
     marker = [torch.tensor([[2.0, -0.1], [2.2, -0.1], [2.2, 0.1], [2.0, 0.1]], dtype=torch.float64)]
     quarter = torch.tensor(math.pi / 2, dtype=torch.float64)
     (turned,) = transform_polygons(marker, torch.zeros(2, dtype=torch.float64), quarter)
     np.testing.assert_allclose(turned.mean(dim=0), [0.0, 2.1], atol=1e-12)
 
 
-def test_jwst_pupil_has_its_struts_where_the_telescope_has() -> None:
+def test_jwst_pupil_has_its_struts_where_the_telescope_has():
     pupil = jwst_pupil(256)
     middle = 128
     # One vertical strut above the centre, none straight below it, a hole in the middle.
@@ -103,12 +95,12 @@ def test_jwst_pupil_has_its_struts_where_the_telescope_has() -> None:
     assert float(pupil.sum()) * (JWST_DIAMETER / 256) ** 2 == pytest.approx(25.77, abs=0.05)
 
 
-def test_pupil_does_not_change_with_the_sampling() -> None:
+def test_pupil_does_not_change_with_the_sampling():
     fine = jwst_pupil(1024).reshape(128, 8, 128, 8).mean(dim=(1, 3))
     torch.testing.assert_close(jwst_pupil(128), fine, rtol=0, atol=1e-9)
 
 
-def test_widening_closes_the_gap_between_segments() -> None:
+def test_widening_closes_the_gap_between_segments():
     outlines = list(jwst_segments().values())
     grown = [widen_polygon(p, TABULATED_GAP / 2) for p in outlines]
     gained = sum(map(area, grown)) - sum(map(area, outlines))
@@ -119,7 +111,7 @@ def test_widening_closes_the_gap_between_segments() -> None:
 
 
 @pytest.mark.parametrize("pupil", ["design", "flight"])
-def test_lyot_stop_stays_inside_the_segments(pupil: str) -> None:
+def test_lyot_stop_stays_inside_the_segments(pupil):
     """The openings hide segment edges and struts."""
     stop = polygon_coverage(maskrnd_openings(), PupilGrid.full(512))
     blocked = stop * (jwst_pupil(512, pupil=pupil) < 0.99)
@@ -128,7 +120,7 @@ def test_lyot_stop_stays_inside_the_segments(pupil: str) -> None:
     assert float(flipped.sum() / stop.sum()) > 0.05
 
 
-def test_lyot_stop_is_where_the_official_one_is() -> None:
+def test_lyot_stop_is_where_the_official_one_is():
     """Area (m^2) and centre of gravity (m) of the official map, to the accuracy of contours.
 
     An earlier table was 0.184 m too high.
@@ -141,7 +133,7 @@ def test_lyot_stop_is_where_the_official_one_is() -> None:
     assert y / float(stop.sum()) == pytest.approx(0.1359, abs=5e-4)
 
 
-def test_obscurations_in_flight_are_only_about_the_struts() -> None:
+def test_obscurations_in_flight_are_only_about_the_struts():
     """A narrower vertical strut, and hinges beside all three: 0.1 % of the light."""
     difference = jwst_pupil(512, pupil="flight") - jwst_pupil(512)
     assert float(difference.abs().sum() / jwst_pupil(512).sum()) == pytest.approx(0.003, abs=0.0005)
@@ -153,7 +145,7 @@ def test_obscurations_in_flight_are_only_about_the_struts() -> None:
         jwst_pupil(64, pupil="RevW")
 
 
-def official(shared_data: Path, file: str) -> torch.Tensor:
+def official(shared_data, file):
     path = shared_data / "stpsf-data" / file
     if not path.exists():
         pytest.skip(f"needs {path}")
@@ -168,9 +160,7 @@ def official(shared_data: Path, file: str) -> torch.Tensor:
         ("flight", "jwst_pupil_flight_npix1024.fits.gz", 5e-4),
     ],
 )
-def test_outlines_are_those_of_the_official_maps(
-    shared_data: Path, shape: str, file: str, limit: float
-) -> None:
+def test_outlines_are_those_of_the_official_maps(shared_data, shape, file, limit):
     """To what a contour of a sampled map can know; behind them images agree to 0.2 %."""
     truth = official(shared_data, file)
     truth = truth / truth.max()
@@ -181,7 +171,7 @@ def test_outlines_are_those_of_the_official_maps(
         else jwst_pupil(1024, pupil=shape)
     )
 
-    def away(other: torch.Tensor) -> float:
+    def away(other):
         return float((mine - other).abs().sum() / truth.sum())
 
     assert away(truth) < limit
@@ -191,7 +181,7 @@ def test_outlines_are_those_of_the_official_maps(
         assert float((jwst_pupil(1024, pupil=other) - truth).abs().sum() / truth.sum()) > 4 * limit
 
 
-def test_crop_pads_with_zeros_where_the_window_sticks_out() -> None:
+def test_crop_pads_with_zeros_where_the_window_sticks_out():
     small = PupilGrid(10, 1.0, (3, 6), (2, 7))
     large = PupilGrid(10, 1.0, (1, 9), (4, 10))
     values = torch.arange(15.0).reshape(3, 5) + 1

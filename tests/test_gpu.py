@@ -5,17 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import device_work as work
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-
-from pyklip_diffrender.optics import OpticalSystem
-
-Array = NDArray[np.float64]
 
 pytestmark = [
     pytest.mark.gpu,
@@ -25,7 +18,7 @@ pytestmark = [
 DTYPES = (torch.float64, torch.float32)
 
 
-def compare(got: list[Array], expected: list[Array], tolerance: float) -> None:
+def compare(got, expected, tolerance):
     """The rms difference, as a fraction of the rms of what is expected."""
     for ours, theirs in zip(got, expected, strict=True):
         error = np.linalg.norm(np.subtract(ours, theirs)) / np.linalg.norm(theirs)
@@ -44,9 +37,7 @@ def compare(got: list[Array], expected: list[Array], tolerance: float) -> None:
         (work.fit_gradient, (1e-9, 2e-4)),
     ],
 )
-def test_images_and_derivatives(
-    compute: Callable[..., list[Array]], tolerances: tuple[float, float], dtype: torch.dtype
-) -> None:
+def test_images_and_derivatives(compute, tolerances, dtype):
     """Against double precision on the processor, in both precisions of the GPU.
 
     On the processor single precision is off by up to 1.4e-5; sources and responses are computed in
@@ -60,7 +51,7 @@ def test_images_and_derivatives(
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_a_search(dtype: torch.dtype) -> None:
+def test_a_search(dtype):
     """Chi-squared, position, flux, contrasts and limits of a joint fit of rolls."""
     frames = work.rolls()
     got, expected = work.search("cuda", frames, dtype=dtype), work.search("cpu", frames)
@@ -69,8 +60,8 @@ def test_a_search(dtype: torch.dtype) -> None:
     np.testing.assert_allclose(got, expected, rtol=rtol, atol=1e-7)
 
 
-def test_a_model_is_on_the_gpu_throughout() -> None:
-    model: OpticalSystem = work.model_on("cuda")
+def test_a_model_is_on_the_gpu_throughout():
+    model = work.model_on("cuda")
     image = model(work.opd())
     assert image.device.type == model.device.type == "cuda"
     assert model.with_fidelity(npix=128).device.type == "cuda"

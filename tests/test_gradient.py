@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.refinement.forward import Problem, State
+from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.refinement.solver import (
     ModelDerivatives,
     Solver,
     StepState,
-    accurate_step,
     conjugate_gradients,
     linearise,
 )
@@ -33,7 +27,7 @@ FREE = ("star_offset", "lyot_shift", "lyot_rotation", "blur", "flux", "backgroun
 SCALES = {"segment": 20.0, "texture": 20.0}
 
 
-def solver_of(frames: int, **changes: object) -> tuple[Solver, State]:
+def solver_of(frames, **changes):
     """A solver and a state away from the solution, for frames in three wavelengths.
 
     All frames show the same pixels, with a pattern of which little is known.
@@ -70,7 +64,7 @@ def solver_of(frames: int, **changes: object) -> tuple[Solver, State]:
     return solver, solver.objective.at(unknowns, vector + 0.1 * moves * moved)
 
 
-def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
+def gradient(solver, state, *, exact):
     """Minus half the derivative of chi-squared."""
     if exact:
         weights = solver.objective.errors(state, 0.01, 4.0)
@@ -79,15 +73,7 @@ def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
     return equations.gradient - equations.curvature @ equations.current
 
 
-def linear_model(
-    solver: Solver, state: State, kappa: float, robust: float = math.inf, *, final: bool = True
-) -> LinearModel:
-    """Of all modes, with the priors of the solver's settings."""
-    priors = solver.priors_of(solver.settings)
-    return solver.linear_model(state, priors, kappa, len(BASIS), robust, final=final)
-
-
-def slope_along(solver: Solver, state: State, direction: Tensor, step: float = 1e-4) -> float:
+def slope_along(solver, state, direction, step=1e-4):
     """Minus half the derivative of chi-squared along a direction, by differences."""
     weights = solver.objective.errors(state, 0.01, 4.0)
     ahead, behind = (
@@ -99,13 +85,13 @@ def slope_along(solver: Solver, state: State, direction: Tensor, step: float = 1
     return -(ahead - behind) / (4 * step)
 
 
-def units(solver: Solver, state: State) -> Tensor:
+def units(solver, state):
     """Prior deviations of the unknowns, and values of those without one."""
     unit = solver.prior_deviation(state.unknowns, solver.priors_of(solver.settings))
     return torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
 
 
-def slopes_by_name(solver: Solver, state: State) -> Iterator[tuple[str, Tensor, float]]:
+def slopes_by_name(solver, state):
     """A random direction within each group of unknowns, and the slope along it by differences."""
     names = [unknown.name for unknown in state.unknowns.labels()]
     assert {*FREE, "amplitude", "modes"} <= set(names)
@@ -116,8 +102,11 @@ def slopes_by_name(solver: Solver, state: State) -> Iterator[tuple[str, Tensor, 
         yield name, direction, slope_along(solver, state, direction)
 
 
-@pytest.mark.parametrize("frames", [1, 2])
-def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
+FRAMES = pytest.mark.parametrize("frames", [pytest.param(1, marks=pytest.mark.slow), 2])
+
+
+@FRAMES
+def test_the_gradient_is_that_of_chi_squared(frames):
     """Against differences of chi-squared, which have an error of 1e-7 of it in these steps."""
     solver, state = solver_of(frames)
     assert solver.objective.shares_pattern == (frames > 1,) * frames
@@ -129,7 +118,7 @@ def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
             assert abs(float(coarse @ direction) - slope) > 1e-2 * abs(slope)
 
 
-def of_the_model_itself(solver: Solver) -> Solver:
+def of_the_model_itself(solver):
     """A solver whose coarse copy is the model."""
     return Solver(
         [forward.problem for forward in solver.objective.forwards],
@@ -140,7 +129,7 @@ def of_the_model_itself(solver: Solver) -> Solver:
 
 
 @pytest.mark.parametrize("contrast", [3e-4, 0.05])
-def test_the_gradient_by_companions_is_that_of_chi_squared(contrast: float) -> None:
+def test_the_gradient_by_companions_is_that_of_chi_squared(contrast):
     """Their images are those of the coarse copy, which is the model in this test."""
     solver, state = solver_of(2)
     solver = of_the_model_itself(solver)
@@ -155,8 +144,8 @@ def test_the_gradient_by_companions_is_that_of_chi_squared(contrast: float) -> N
         np.testing.assert_allclose(float(exact[place]), slope, rtol=1e-3)
 
 
-@pytest.mark.parametrize("frames", [1, 2])
-def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames: int) -> None:
+@FRAMES
+def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames):
     """It outshines the star. Neglected, the gradient would be wrong by more than its size."""
     solver, state = solver_of(frames)
     solver = of_the_model_itself(solver)
@@ -169,32 +158,8 @@ def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames: int) ->
             np.testing.assert_allclose(float(each @ direction), slope, rtol=2e-3, err_msg=name)
 
 
-def test_the_exact_gradient_has_the_light_of_all_companions() -> None:
-    """The Jacobian has that of the brightest only, so the minimum must not depend on it."""
-    solver, state = solver_of(1)
-    solver = of_the_model_itself(solver)
-    companions = [dr.Planet(0.05, 0.5, 20.0), dr.Planet(0.03, 0.4, 200.0)]
-    state = solver.objective.at(*state.unknowns.with_companions(companions, state.vector))
-    exact, copied = (gradient(solver, state, exact=value) for value in (True, False))
-    errors = []
-    for name, direction, slope in slopes_by_name(solver, state):
-        np.testing.assert_allclose(float(exact @ direction), slope, rtol=2e-3, err_msg=name)
-        errors.append(abs(float(copied @ direction) / slope - 1))
-    assert max(errors) > 0.02
-
-
-def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
-    """But for single precision, in which the derivatives of the copy are stored."""
-    solver, state = solver_of(1)
-    same = of_the_model_itself(solver)
-    exact, copied = (gradient(same, state, exact=value) for value in (True, False))
-    scale = same.prior_deviation(state.unknowns, same.priors_of(same.settings)).clamp(max=1e6)
-    error = ((exact - copied) * scale).norm() / (exact * scale).norm()
-    assert error < 1e-4
-
-
-@pytest.mark.parametrize("frames", [1, 2])
-def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> None:
+@FRAMES
+def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames):
     """Against the equations of a copy that is the model; those of a coarse one are far from it."""
     solver, state = solver_of(frames)
     assert solver.objective.shares_pattern == (frames > 1,) * frames
@@ -214,96 +179,8 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     assert (products[0] - expected).norm() > 0.1 * expected.norm()
 
 
-def test_the_light_of_a_faint_companion_is_linear_in_the_curvature() -> None:
-    """As in the Jacobian: it depends on contrast, position and flux, and not on the wavefront."""
-    solver, state = solver_of(2)
-    solver = of_the_model_itself(solver)
-    companions = [dr.Planet(9e-5, 0.5, 20.0), dr.Planet(0.03, 0.4, 200.0)]
-    state = solver.objective.at(*state.unknowns.with_companions(companions, state.vector))
-    weights = solver.objective.errors(state, 0.01, 4.0)
-    equations = linearise(solver.objective, state, 0.01, len(BASIS), 4.0)
-    derivatives = ModelDerivatives(solver.objective, state, weights)
-    unit = units(solver, state)
-    where = state.unknowns.where("companions")
-    # By one unknown at a time, because those of the faint companion change little of the whole.
-    for place in (*range(where.start, where.stop), 0, state.unknowns.size - 1):
-        step = torch.zeros_like(unit)
-        step[place] = 0.01 * unit[place]
-        product, expected = unit * derivatives.product(step), unit * (equations.curvature @ step)
-        assert (product - expected).norm() < 2e-3 * expected.norm()
-
-
-def test_the_light_of_a_faint_companion_follows_the_flux() -> None:
-    """Beside the star it hardly shows in products of the whole curvature."""
-    solver, state = solver_of(1)
-    companion = dr.Planet(9e-5, 0.5, 20.0)
-    state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
-    derivatives = ModelDerivatives(
-        solver.objective, state, solver.objective.errors(state, 0.01, 4.0)
-    )
-    (point,) = state.points
-    flux, step = point.unknowns.where("flux"), torch.zeros_like(point.vector)
-    step[flux] = 0.01 * point.vector[flux]
-    light = point.total - point.star
-    assert light.max() > 0
-    torch.testing.assert_close(
-        derivatives._change_of_faint(0, step), 0.01 * light, rtol=1e-6, atol=1e-6 * light.max()
-    )
-
-
-def test_a_companion_that_the_model_error_outweighs_counts_in_the_last_derivatives_only() -> None:
-    solver, state = solver_of(1, relinearise=0.1, accurate_steps=True)
-    companion = dr.Planet(0.01, 0.5, 20.0)
-    state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
-    modes, kappas = state.unknowns.where("modes"), (0.1, 0.0)
-    early, late, same = (
-        linear_model(solver, state, kappa, final=False).frames[0].jacobian
-        for kappa in (*kappas, 0.001)
-    )
-    assert (early[modes] - late[modes]).norm() > 0.01 * late[modes].norm()
-    assert same is late
-    assert linear_model(solver, state, 0.1).frames[0].jacobian is late
-
-
-@pytest.mark.slow
-def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
-    """In as many iterations as are needed, whatever the coarse copy that preconditions them."""
-    solver, state = solver_of(1)
-    same = of_the_model_itself(solver)
-    weights = solver.objective.errors(state, 0.01, 4.0)
-    priors = solver.priors_of(solver.settings)
-    deviation = solver.prior_deviation(state.unknowns, priors)
-    coarse, fine = (
-        linearise(each.objective, state, 0.01, len(BASIS), 4.0) for each in (solver, same)
-    )
-    derivatives = ModelDerivatives(solver.objective, state, weights)
-    # Equations of the starting values precondition as well.
-    start = solver.objective.at(state.unknowns, state.unknowns.initial())
-    earlier = linearise(solver.objective, start, 0.1, len(BASIS), 4.0)
-    direct = same._solve(state.unknowns, fine, priors).step - fine.current
-    steps = []
-    for equations in (coarse, earlier):
-        step, settled = accurate_step(
-            derivatives,
-            equations.curvature,
-            fine.current,
-            deviation,
-            enough=0.0,
-            iterations=20,
-            sufficient=0.0,
-        )
-        assert not settled  # Every iteration lowers it, if only by a little.
-        steps.append(step)
-    too_coarse = solver._solve(state.unknowns, coarse, priors).step - coarse.current
-    errors = same._solve(state.unknowns, fine, priors, errors=True).variance.sqrt()
-    assert (direct / errors).norm() > 10
-    for step in steps:
-        assert ((step - direct) / errors).norm() < 0.3
-    assert ((too_coarse - direct) / errors).norm() > 5
-
-
 @pytest.mark.parametrize("wrong", [0, 1, 3])
-def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong: int) -> None:
+def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong):
     """Of that many directions the preconditioner says far too little; two more iterations end."""
     rng = np.random.default_rng(8)
     vectors = torch.from_numpy(np.linalg.qr(rng.normal(size=(20, 20)))[0])
@@ -312,7 +189,7 @@ def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong: i
     stated[:wrong] /= 10.0 ** (2 + torch.arange(wrong))
     products = []
 
-    def product(x: Tensor) -> Tensor:
+    def product(x):
         products.append(x)
         return vectors @ (powers * (vectors.T @ x))
 
@@ -330,7 +207,7 @@ def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong: i
     assert len(products) <= wrong + 2
 
 
-def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner() -> None:
+def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner():
     """And end without a step where there is nothing to gain."""
     rng = np.random.default_rng(9)
     matrix = torch.from_numpy(rng.normal(size=(30, 30)))
@@ -345,62 +222,8 @@ def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner(
     assert not x.any()
 
 
-def test_conjugate_gradients_do_not_end_by_what_the_preconditioner_expects() -> None:
-    """It expects a decrease of 1 where there is one of 100, of which 5 would matter."""
-    gradient = torch.tensor([10.0])
-    x, settled = conjugate_gradients(lambda x: x, lambda x: x / 100, gradient, enough=5.0)
-    assert settled
-    torch.testing.assert_close(x, gradient)
-
-
-def test_accurate_steps_keep_their_equations() -> None:
-    """Until conjugate gradients need more iterations than there are, and until a companion."""
-    solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
-    # Of the model itself: one iteration is enough with equations of nearly the same state.
-    solver = of_the_model_itself(solver)
-    weights = solver.objective.errors(state, 0.01, 4.0)
-    carried = StepState(solver.priors_of(solver.settings))
-    before = solver._cost(state, weights, carried.priors)
-
-    def replaces(state: State, kappa: float) -> bool:
-        """Whether a step from a state makes new equations."""
-        equations = solver.equations.last
-        solver._accurate_step(state, carried, kappa, len(BASIS))
-        return solver.equations.last is not equations
-
-    after = solver._accurate_step(state, carried, 0.01, len(BASIS)).state
-    assert solver._cost(after, weights, carried.priors) < 0.9 * before
-    assert not replaces(after, 0.01)
-    solver.equations.judge(preconditions=False)
-    assert replaces(after, 0.01)
-    # Weights of a smaller model error are others, those of a little smaller one are not.
-    assert not replaces(after, 0.008)
-    assert replaces(after, 0.002)
-    grown = solver.objective.at(
-        *after.unknowns.with_companions([dr.Planet(1e-4, 0.3, 20.0)], after.vector)
-    )
-    assert replaces(grown, 0.002)
-
-
-def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
-    solver = of_the_model_itself(solver)
-    carried = StepState(solver.priors_of(solver.settings))
-    after = solver._accurate_step(state, carried, 0.01, len(BASIS)).state
-    earlier, right = solver.equations.last, accurate_step
-
-    def wrong(*arguments: Any, **options: Any) -> tuple[Tensor, bool]:
-        step, settled = right(*arguments, **options)
-        return (-step if solver.equations.last is earlier else step), settled
-
-    monkeypatch.setattr("pyklip_diffrender.refinement.solver.accurate_step", wrong)
-    last = solver._accurate_step(after, carried, 0.01, len(BASIS))
-    assert last.gain > 0
-    assert last.state is not after
-
-
 @pytest.mark.parametrize("accurate", [False, True])
-def test_a_step_depends_on_its_arguments_alone(accurate: bool) -> None:
+def test_a_step_depends_on_its_arguments_alone(accurate):
     """Not on the steps before it: what these hand on is an argument."""
     solver, state = solver_of(1, relinearise=1e-9, accurate_steps=accurate)
     first = StepState(solver.priors_of(solver.settings), damping=0.3, kappa=0.1)
@@ -418,37 +241,3 @@ def test_a_step_depends_on_its_arguments_alone(accurate: bool) -> None:
         solver.step(state, replace(first, damping=30.0), 0.02, len(BASIS)).state.vector,
         once.state.vector,
     )
-
-
-def test_other_weights_need_no_new_jacobian() -> None:
-    """Neither for the errors of all pixels nor where a pixel is left out; the model is the same."""
-    models = []
-    for goes_on in (True, False):
-        solver, state = solver_of(2, relinearise=0.1, accurate_steps=True)
-        if goes_on:  # The second solver begins where the first one ends.
-            models = [
-                linear_model(solver, state, kappa, robust, final=False)
-                for kappa, robust in ((0.01, 4.0), (0.0, math.inf))
-            ]
-        mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-        mask[7, 9] = True
-        solver.leave_out([mask, ~mask & mask])
-        models.append(linear_model(solver, state, 0.0, final=False))
-    *same, new = ([frame.jacobian for frame in model.frames] for model in models)
-    assert all(each[k] is same[0][k] for each in same for k in range(2))
-    assert new[0] is not same[0][0]
-    torch.testing.assert_close(models[2].curvature, models[3].curvature, rtol=1e-6, atol=0.0)
-    assert models[2].frames[0].weight[7, 9] == 0
-
-
-def test_derivatives_by_a_frame_become_those_by_all_unknowns() -> None:
-    """The adjoint of `of_unknowns`, with modes that drift between the frames."""
-    solver, state = solver_of(2, drift=WavefrontPrior(SCALES, fit_scales=False))
-    assert solver.priors_of(solver.settings).drift > 0
-    rng = np.random.default_rng(10)
-    joint = torch.from_numpy(rng.normal(size=state.unknowns.size))
-    for k in range(2):
-        own = torch.from_numpy(rng.normal(size=len(state.points[k].vector)))
-        there = state.unknowns.rows[k].of_unknowns(joint) @ own
-        back = joint @ state.unknowns.rows[k].onto_unknowns(own, len(joint))
-        assert float(there) == pytest.approx(float(back))

@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy.signal import convolve2d
 
 import pyklip_diffrender as dr
@@ -21,7 +20,7 @@ PLACE = (0.45, 0.3)
 
 
 @cache
-def fit() -> dr.Refinement:
+def fit():
     """Two rolls of a star with a faint planet, fitted without it."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
     opd = dr.random_opd(1, npix=NPIX)
@@ -39,18 +38,18 @@ def fit() -> dr.Refinement:
 
 
 @cache
-def sky() -> SkyModel:
+def sky():
     return SkyModel([fit()])
 
 
-def convolution(kernel: NDArray[np.float64], ny: int, nx: int) -> NDArray[np.float64]:
+def convolution(kernel, ny, nx):
     """Convolution of an image, zero beyond its edges, with a kernel, as a matrix."""
     unit = np.eye(ny * nx).reshape(-1, ny, nx)
     columns = [convolve2d(pixel, kernel, mode="same").ravel() for pixel in unit]
     return np.array(columns).T
 
 
-def dense(model: SkyModel) -> NDArray[np.float64]:
+def dense(model):
     """Posterior mean of the peaks of point sources, as a matrix that multiplies the data."""
     linear, _ = model.groups[0]
     ny, nx = linear.frames[0].residual.shape
@@ -69,7 +68,7 @@ def dense(model: SkyModel) -> NDArray[np.float64]:
     return np.linalg.solve(np.eye(len(prior)) + weighted @ h, weighted)
 
 
-def test_the_estimate_is_that_of_the_closed_form() -> None:
+def test_the_estimate_is_that_of_the_closed_form():
     model = sky()
     data = np.concatenate([model.light()[0][k][0].numpy().ravel() for k in (0, 1)])
     sources = (dense(model) @ data).reshape(model.shape)
@@ -79,7 +78,7 @@ def test_the_estimate_is_that_of_the_closed_form() -> None:
     np.testing.assert_allclose(estimate, expected, atol=4e-3 * np.abs(expected).max())
 
 
-def test_the_error_is_that_of_the_closed_form() -> None:
+def test_the_error_is_that_of_the_closed_form():
     model = sky()
     linear, _ = model.groups[0]
     ny, nx = linear.frames[0].residual.shape
@@ -104,7 +103,7 @@ def test_the_error_is_that_of_the_closed_form() -> None:
         assert np.median(error[chosen]) == pytest.approx(expected, rel=0.12)
 
 
-def test_a_source_in_white_noise_keeps_its_peak() -> None:
+def test_a_source_in_white_noise_keeps_its_peak():
     """Noise of 1 everywhere, a prior of the stated S/N, frames that repeat beyond their edges."""
     model = sky()
     kernel = model._point_sources[0]
@@ -125,7 +124,7 @@ def test_a_source_in_white_noise_keeps_its_peak() -> None:
     assert fwhm == pytest.approx(_BEAM * model.resolution, rel=0.02)
 
 
-def test_a_source_has_the_stated_throughput() -> None:
+def test_a_source_has_the_stated_throughput():
     model = sky()
     _, templates = model.groups[0]
     row, column = 16, 19
@@ -149,7 +148,7 @@ def test_a_source_has_the_stated_throughput() -> None:
     assert ((stated > 0.3) & (stated < 1.1)).all()
 
 
-def test_interpolation_turns_a_smooth_image_exactly_enough() -> None:
+def test_interpolation_turns_a_smooth_image_exactly_enough():
     y, x = np.indices((21, 23)).astype(float)
     image = np.exp(-((x - 11.3) ** 2 + (y - 9.6) ** 2) / (2 * 1.5**2))
     places = np.random.default_rng(1).uniform(4, 16, (50, 2))

@@ -16,9 +16,9 @@ from pyklip_diffrender.io.headers import KEYWORDS, fits_unit, set_keyword
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def written_keywords() -> set[str]:
+def written_keywords():
     """Texts of the package's modules that look like keywords of its own."""
-    names: set[str] = set()
+    names = set()
     for path in (ROOT / "pyklip_diffrender").rglob("*.py"):
         if path.name == "keywords.py":
             continue
@@ -29,12 +29,12 @@ def written_keywords() -> set[str]:
     return names - {"DRFM"}
 
 
-def test_every_keyword_that_is_written_is_declared() -> None:
+def test_every_keyword_that_is_written_is_declared():
     formed = {f"DRFM{axis}{end}" for axis in ("RA", "DE") for end in ("", "ER")}
     assert written_keywords() | formed == set(KEYWORDS)
 
 
-def test_keywords_fit_on_cards() -> None:
+def test_keywords_fit_on_cards():
     assert all(len(name) <= 8 for name in KEYWORDS)
     header = fits.Header()
     for name, each in KEYWORDS.items():
@@ -45,7 +45,7 @@ def test_keywords_fit_on_cards() -> None:
     assert len(header.tostring()) % 2880 == 0
 
 
-def test_values_are_such_as_headers_can_hold() -> None:
+def test_values_are_such_as_headers_can_hold():
     header = fits.Header()
     set_keyword(header, "DRCHI2", math.nan)
     set_keyword(header, "DRSYST", "Übersicht β")
@@ -58,6 +58,6 @@ def test_values_are_such_as_headers_can_hold() -> None:
     ("unit", "text"),
     [("MJy/sr", "MJy/sr"), ("MJy sr-1", "MJy/sr"), ("electron / s", "electron / s"), ("", "")],
 )
-def test_units_are_spelled_as_the_pipeline_does(unit: str, text: str) -> None:
+def test_units_are_spelled_as_the_pipeline_does(unit, text):
     assert fits_unit(u.Unit(unit)) == text
     assert u.Unit(text) == u.Unit(unit)

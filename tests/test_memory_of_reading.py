@@ -5,8 +5,6 @@ from __future__ import annotations
 import gc
 import gzip
 import tracemalloc
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,18 +20,18 @@ from pyklip_diffrender.scene.observation import Observation
 MANY = 32
 
 
-def spoilt(arrays: dict[str, Any]) -> None:
+def spoilt(arrays):
     """One integration is empty, one has an afterglow, and some pixels are flagged or NaN."""
     arrays["DQ"][3] = 1
     arrays["SCI"][7] += 30.0
     arrays["DQ"][:, 20, 30], arrays["SCI"][5, 40, 50] = 1, np.nan
 
 
-def plain(folder: Path) -> Path:
+def plain(folder):
     return calints(folder / "a_calints.fits", integrations=MANY, change=spoilt)
 
 
-def shifted(folder: Path) -> Path:
+def shifted(folder):
     """As spaceKLIP aligns frames: with recorded shifts, which are undone."""
     path = plain(folder)
     shifts = np.random.default_rng(1).uniform(-0.3, 0.3, (MANY, 2))
@@ -42,7 +40,7 @@ def shifted(folder: Path) -> Path:
     return path
 
 
-def packed(folder: Path) -> Path:
+def packed(folder):
     path = plain(folder)
     target = path.with_name(f"{path.name}.gz")
     target.write_bytes(gzip.compress(path.read_bytes(), 1))
@@ -50,7 +48,7 @@ def packed(folder: Path) -> Path:
     return target
 
 
-def peak(read: Any) -> int:
+def peak(read):
     """Bytes that a call holds at most, of those that Python and numpy ask for."""
     gc.collect()
     tracemalloc.start()
@@ -63,8 +61,8 @@ def peak(read: Any) -> int:
 
 @pytest.mark.parametrize("write", [plain, shifted, packed])
 def test_a_sequence_takes_at_most_one_and_a_half_times_its_largest_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Any
-) -> None:
+    tmp_path, monkeypatch, write
+):
     monkeypatch.setattr(files, "_IN_MEMORY", 2**18)
     path = write(tmp_path)
     monkeypatch.setattr(integrations, "_AT_ONCE", 2**16)
@@ -75,9 +73,7 @@ def test_a_sequence_takes_at_most_one_and_a_half_times_its_largest_file(
 
 
 @pytest.mark.parametrize("write", [plain, shifted, packed])
-def test_the_means_of_a_file_are_those_of_its_integrations(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Any
-) -> None:
+def test_the_means_of_a_file_are_those_of_its_integrations(tmp_path, monkeypatch, write):
     path = write(tmp_path)
     frames = Observation.from_fits(path)
     assert len(frames) == MANY - 2
@@ -100,7 +96,7 @@ def test_the_means_of_a_file_are_those_of_its_integrations(
         np.testing.assert_allclose(means.combined().data, wanted.data, atol=1e-5)
 
 
-def _groups(frames: Observation, means: Observation) -> list[np.ndarray]:
+def _groups(frames, means):
     """The integrations that each mean was made of: those of the pointings of the file."""
     names = [part.center for part in frames.pointings()]
     return [
@@ -108,7 +104,7 @@ def _groups(frames: Observation, means: Observation) -> list[np.ndarray]:
     ]
 
 
-def test_a_sequence_counts_the_integrations_of_its_means(tmp_path: Path) -> None:
+def test_a_sequence_counts_the_integrations_of_its_means(tmp_path):
     sequence = dr.Sequence.from_files([plain(tmp_path)])
     assert len(sequence.science[0]) == 1
     assert sequence.science[0].count == MANY - 2

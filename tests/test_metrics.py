@@ -20,7 +20,7 @@ PLANET = (15.0, 12.0)
 SHAPE = (25, 21)
 
 
-def pixels_within(position: tuple[float, float], radius: float) -> list[tuple[int, int]]:
+def pixels_within(position, radius):
     return [
         (y, x)
         for y in range(SHAPE[0])
@@ -30,13 +30,13 @@ def pixels_within(position: tuple[float, float], radius: float) -> list[tuple[in
 
 
 @pytest.fixture
-def planet() -> np.ndarray:
+def planet():
     """A round spot of known values, lopsided in y."""
     y, x = np.indices(SHAPE)
     return np.exp(-0.3 * ((x - PLANET[0]) ** 2 + (y - PLANET[1] - 0.3) ** 2))
 
 
-def test_aperture_sum_takes_the_pixels_whose_centres_lie_inside() -> None:
+def test_aperture_sum_takes_the_pixels_whose_centres_lie_inside():
     image = np.arange(25.0 * 21).reshape(SHAPE)
     # Radius 1.5 about a pixel's centre: the 3 x 3 block. Its mean is the middle pixel.
     assert aperture_sum(image, PLANET, 1.5) == 9 * image[12, 15]
@@ -46,7 +46,7 @@ def test_aperture_sum_takes_the_pixels_whose_centres_lie_inside() -> None:
     assert aperture_sum(0 * image, PLANET, 1.5) == 0
 
 
-def test_annulus_snr_of_a_chessboard() -> None:
+def test_annulus_snr_of_a_chessboard():
     """Signal 7 on 9 pixels, +-1 elsewhere: mean m and deviation sqrt(1 - m^2) by counting."""
     y, x = np.indices(SHAPE)
     image = np.where((x + y) % 2 == 0, 1.0, -1.0)
@@ -69,39 +69,7 @@ def test_annulus_snr_of_a_chessboard() -> None:
     )
 
 
-def test_annulus_snr_does_not_see_what_is_elsewhere(rng: np.random.Generator) -> None:
-    image = rng.normal(size=SHAPE)
-    before = annulus_snr(image, PLANET, CENTER)
-    y, x = np.indices(SHAPE)
-    distance = np.hypot(x - CENTER[0], y - CENTER[1])
-    image[(distance < 3.4) | (distance > 6.6)] = 1e6
-    assert annulus_snr(image, PLANET, CENTER) == before
-
-
-def test_annulus_snr_leaves_out_what_is_not_a_number(rng: np.random.Generator) -> None:
-    image = rng.normal(size=SHAPE)
-    image[11:14, 14:17] = 50.0
-    image[12, 15] = image[12, 5] = np.nan
-    near = 8
-    ring = [
-        image[p]
-        for p in set(pixels_within(CENTER, 6.5))
-        - set(pixels_within(CENTER, 3.49999))
-        - set(pixels_within(PLANET, 1.5))
-        if np.isfinite(image[p])
-    ]
-    expected = (50 - np.mean(ring)) / np.std(ring) * math.sqrt(near)
-    assert annulus_snr(image, PLANET, CENTER) == pytest.approx(expected, rel=1e-12)
-
-
-def test_annulus_snr_of_an_empty_image_is_no_number() -> None:
-    with pytest.warns(RuntimeWarning, match="invalid value"):
-        assert math.isnan(annulus_snr(np.zeros(SHAPE), PLANET, CENTER))
-
-
-def test_throughput_is_the_amplitude_of_the_planet(
-    planet: np.ndarray, rng: np.random.Generator
-) -> None:
+def test_throughput_is_the_amplitude_of_the_planet(planet, rng):
     noise = rng.uniform(0.5, 2.0, SHAPE)
     for share in (1.0, 0.99, 0.71, 0.0, -0.2):
         assert throughput(share * planet, planet, noise, PLANET) == pytest.approx(share, abs=1e-12)
@@ -110,7 +78,7 @@ def test_throughput_is_the_amplitude_of_the_planet(
     assert abs(throughput(transposed, planet, noise, PLANET)) < 0.9
 
 
-def test_throughput_weighs_pixels_by_their_noise() -> None:
+def test_throughput_weighs_pixels_by_their_noise():
     """Two pixels: sum(p d / s^2) / sum(p^2 / s^2) = (1*3/1 + 2*1/4) / (1/1 + 4/4) = 1.75."""
     planet, image, noise = np.zeros(SHAPE), np.zeros(SHAPE), np.ones(SHAPE)
     planet[12, 15], planet[12, 16] = 1.0, 2.0
@@ -124,7 +92,7 @@ def test_throughput_weighs_pixels_by_their_noise() -> None:
     assert throughput(image, planet, noise, PLANET) == pytest.approx(0.5, rel=1e-14)
 
 
-def test_star_model_error_is_an_rms_over_the_ring_in_units_of_the_noise() -> None:
+def test_star_model_error_is_an_rms_over_the_ring_in_units_of_the_noise():
     truth = np.full(SHAPE, 100.0)
     noise = np.full(SHAPE, 5.0)
     y, x = np.indices(SHAPE)
@@ -138,16 +106,7 @@ def test_star_model_error_is_an_rms_over_the_ring_in_units_of_the_noise() -> Non
     assert star_model_error(ramp, truth + y, noise, CENTER, 3, 6) > 0.5
 
 
-def test_star_model_error_of_two_values() -> None:
-    """A radius that takes five pixels: sqrt((2^2 + 0 + 0 + 0 + 1^2) / 5) = 1."""
-    truth, noise = np.zeros(SHAPE), np.ones(SHAPE)
-    noise[12, 11] = 3.0
-    model = truth.copy()
-    model[12, 10], model[12, 11] = 2.0, -3.0
-    assert star_model_error(model, truth, noise, CENTER, 0, 1) == pytest.approx(1.0, rel=1e-14)
-
-
-def test_psnr_of_a_known_error(planet: np.ndarray) -> None:
+def test_psnr_of_a_known_error(planet):
     """Peak p, constant error e: 20 log10(p / e)."""
     peak = float(planet.max())
     assert psnr(planet + 0.01 * peak, planet, PLANET) == pytest.approx(40.0, abs=1e-9)
@@ -159,14 +118,3 @@ def test_psnr_of_a_known_error(planet: np.ndarray) -> None:
     nothing = psnr(0 * planet, planet, PLANET)
     assert nothing == pytest.approx(expected - 40, abs=1e-9)
     assert psnr(planet[::-1], planet, PLANET) < 40
-
-
-def test_psnr_sees_its_window_only(planet: np.ndarray) -> None:
-    image = planet + 0.01
-    inside = psnr(image, planet, PLANET)
-    image[:7], image[18:], image[:, :10] = 1e9, 1e9, 1e9
-    assert psnr(image, planet, PLANET) == inside
-    # At the edge of the image the window is cut.
-    assert psnr(planet + 0.01, planet, (0.0, 0.0)) == pytest.approx(
-        20 * math.log10(planet[:6, :6].max() / 0.01), abs=1e-9
-    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pyklip_diffrender.scene import calibrated_errors
 
@@ -12,7 +11,7 @@ SCALE = (0.063, 0.063)
 CENTER = np.array([[150.0, 150.0]])
 
 
-def frames(noise: float, stated: float) -> tuple[NDArray[np.float64], ...]:
+def frames(noise, stated):
     """A star with photon noise on a background of constant noise, and the errors of a file."""
     y, x = np.indices((300, 300))
     distance = np.hypot(x - 150, y - 150)
@@ -24,13 +23,13 @@ def frames(noise: float, stated: float) -> tuple[NDArray[np.float64], ...]:
 
 
 @pytest.mark.parametrize("noise", [0.3, 0.5, 0.8])
-def test_the_constant_part_of_the_errors_is_measured(noise: float) -> None:
+def test_the_constant_part_of_the_errors_is_measured(noise):
     data, error, photon = frames(noise, 0.5)
     found, _ = calibrated_errors(data, error, np.ones(data.shape, bool), CENTER, SCALE)
     np.testing.assert_allclose(found, np.hypot(noise, photon), rtol=0.03)
 
 
-def test_outliers_and_masked_pixels_do_not_change_the_factor() -> None:
+def test_outliers_and_masked_pixels_do_not_change_the_factor():
     data, error, photon = frames(0.3, 0.5)
     valid = np.ones(data.shape, bool)
     data[0, 5:15, 40:60] += 50.0  # A background source.
@@ -42,7 +41,7 @@ def test_outliers_and_masked_pixels_do_not_change_the_factor() -> None:
     np.testing.assert_array_equal(found[~valid], error[~valid])
 
 
-def test_frames_without_far_pixels_keep_their_errors() -> None:
+def test_frames_without_far_pixels_keep_their_errors():
     data, error, _ = frames(0.3, 0.5)
     near = (slice(None), slice(110, 190), slice(110, 190))
     found, ratios = calibrated_errors(

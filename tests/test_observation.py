@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from astropy import units as u
 from astropy.io import fits
+from small_files import AREA, calints
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import (
@@ -25,54 +24,14 @@ from pyklip_diffrender.optics.fast_path import finest_spacing
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.observation import Observation
 
-AREA = 0.00396
-"""arcsec^2 of a pixel."""
-
-
-def calints(
-    path: Path,
-    data: np.ndarray,
-    error: np.ndarray | None = None,
-    quality: np.ndarray | None = None,
-    *,
-    leave_out: tuple[str, ...] = (),
-    **changes: object,
-) -> Path:
-    """A small calints file, headers as the JWST pipeline writes them."""
-    primary = {"FILTER": "F444W", "DATE-BEG": "2022-07-30T02:03:04.5", "INSTRUME": "NIRCAM"}
-    science = {
-        "BUNIT": "MJy/sr", "PIXAR_A2": AREA, "CRPIX1": 6.0, "CRPIX2": 5.0, "ROLL_REF": 100.0,
-        "V3I_YANG": -0.5, "VPARITY": -1,
-    }  # fmt: skip
-    hdus = [fits.PrimaryHDU()]
-    error = np.ones_like(data) if error is None else error
-    quality = np.zeros(data.shape, dtype=np.uint32) if quality is None else quality
-    for name, array in (("SCI", data), ("ERR", error), ("DQ", quality)):
-        if name not in leave_out:
-            hdus.append(fits.ImageHDU(array, name=name))
-    for header, entries in ((hdus[0].header, primary), (hdus[1].header, science)):
-        for key, value in entries.items():
-            value = changes.get(key.replace("-", "_"), value)
-            if value is not None:
-                header[key] = value
-    for key in set(changes) - {k.replace("-", "_") for k in (*primary, *science)}:
-        hdus[1].header[key.replace("_", "-")] = changes[key]
-    fits.HDUList(hdus).writeto(path)
-    return path
-
 
 @pytest.fixture
-def frames(rng: np.random.Generator) -> np.ndarray:
+def frames(rng):
     """Two frames of 8 rows and 10 columns: no symmetry that could hide a transposition."""
     return rng.normal(10, 2, size=(2, 8, 10)).astype(np.float32)
 
 
-# -- JWST files ------------------------------------------------------------------------------
-
-
-def test_a_calints_file_is_read_with_everything_in_it(
-    tmp_path: Path, frames: np.ndarray, rng: np.random.Generator
-) -> None:
+def test_a_calints_file_is_read_with_everything_in_it(tmp_path, frames, rng):
     error = rng.uniform(0.5, 2, size=frames.shape).astype(np.float32)
     got = Observation.from_fits(calints(tmp_path / "jw_calints.fits", frames, error))
     np.testing.assert_array_equal(got.data, frames.astype(np.float64))
@@ -82,7 +41,6 @@ def test_a_calints_file_is_read_with_everything_in_it(
     assert got.unit == u.MJy / u.sr
     assert got.pixelscale == pytest.approx((AREA**0.5, AREA**0.5), rel=1e-12)
     assert got.filter == "F444W"
-    assert got.date is not None
     assert got.date.isot == "2022-07-30T02:03:04.500"
     assert got.name == "jw_calints.fits"
     assert len(got) == 2
@@ -94,9 +52,7 @@ def test_a_calints_file_is_read_with_everything_in_it(
     np.testing.assert_allclose(got.position_angles, [100.0 - 0.5] * 2)
 
 
-def test_the_star_position_is_converted_from_one_indexed_to_zero_indexed(
-    tmp_path: Path, frames: np.ndarray
-) -> None:
+def test_the_star_position_is_converted_from_one_indexed_to_zero_indexed(tmp_path, frames):
     plain = Observation.from_fits(calints(tmp_path / "a.fits", frames))
     np.testing.assert_array_equal(plain.center, [[5.0, 4.0]] * 2)
     measured = Observation.from_fits(
@@ -112,9 +68,7 @@ def test_the_star_position_is_converted_from_one_indexed_to_zero_indexed(
     [(0, True), (1, False), (2, False), (4, True), (512, False), (1024, False), (2048, True),
      (4 + 1, False), (2**31, True)],
 )  # fmt: skip
-def test_data_quality_bits_take_pixels_out(
-    tmp_path: Path, frames: np.ndarray, bit: int, good: bool
-) -> None:
+def test_data_quality_bits_take_pixels_out(tmp_path, frames, bit, good):
     quality = np.zeros(frames.shape, dtype=np.uint32)
     quality[1, 2, 7] = bit
     got = Observation.from_fits(calints(tmp_path / "dq.fits", frames, quality=quality))
@@ -125,9 +79,7 @@ def test_data_quality_bits_take_pixels_out(
     assert bool(bit & BAD_PIXEL_BITS) != good
 
 
-def test_without_quality_only_nan_is_masked_and_that_is_said(
-    tmp_path: Path, frames: np.ndarray
-) -> None:
+def test_without_quality_only_nan_is_masked_and_that_is_said(tmp_path, frames):
     frames[0, 1, 2] = np.nan
     path = calints(tmp_path / "nodq.fits", frames, leave_out=("DQ",))
     with pytest.warns(DiffrenderWarning, match=r"nodq\.fits: no DQ"):
@@ -135,15 +87,8 @@ def test_without_quality_only_nan_is_masked_and_that_is_said(
     assert np.argwhere(~got.valid).tolist() == [[0, 1, 2]]
 
 
-def test_a_single_frame_is_a_stack_of_one(tmp_path: Path, frames: np.ndarray) -> None:
-    got = Observation.from_fits(calints(tmp_path / "cal.fits", frames[0]))
-    np.testing.assert_array_equal(got.data, frames[:1])
-    assert got.position_angles is not None
-    assert got.position_angles.shape == (1,)
-
-
 @pytest.mark.hard
-def test_scaled_integers_equal_their_values(tmp_path: Path, frames: np.ndarray) -> None:
+def test_scaled_integers_equal_their_values(tmp_path, frames):
     counts = np.round(frames * 100).astype(np.int16)
     path = calints(tmp_path / "int16.fits", counts, np.ones_like(frames))
     with fits.open(path, mode="update", do_not_scale_image_data=True) as hdus:
@@ -152,52 +97,21 @@ def test_scaled_integers_equal_their_values(tmp_path: Path, frames: np.ndarray) 
     np.testing.assert_array_equal(Observation.from_fits(path).data, counts * 0.25 + 3.0)
 
 
-# -- files that will not do ------------------------------------------------------------------
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("percent", [25, 50, 99])
-@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
-def test_a_truncated_file_is_an_error_that_names_it(
-    tmp_path: Path, frames: np.ndarray, suffix: str, percent: int
-) -> None:
-    # Nothing compresses worse than a file that does: long runs make early ends of streams.
-    path = calints(tmp_path / f"cut{suffix}", np.tile(frames, (1, 8, 8)))
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    with pytest.raises(CorruptFileError, match=r"cut\.fits"):
-        Observation.from_fits(path)
-
-
 @pytest.mark.parametrize("name", ["SCI", "ERR"])
-def test_a_missing_extension_is_named(tmp_path: Path, frames: np.ndarray, name: str) -> None:
+def test_a_missing_extension_is_named(tmp_path, frames, name):
     path = calints(tmp_path / "part.fits", frames, leave_out=(name,))
     with pytest.raises(CorruptFileError, match=rf"part\.fits: no {name} extension"):
         Observation.from_fits(path)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CorruptFileError, match=r"nowhere\.fits"):
-        Observation.from_fits(tmp_path / "nowhere.fits")
-
-
 @pytest.mark.parametrize("unit", [None, "", "parsnips"])
-def test_a_missing_or_unknown_unit_is_an_error(
-    tmp_path: Path, frames: np.ndarray, unit: str | None
-) -> None:
+def test_a_missing_or_unknown_unit_is_an_error(tmp_path, frames, unit):
     path = calints(tmp_path / "unit.fits", frames, BUNIT=unit)
     with pytest.raises(UnitError, match=r"unit\.fits.*(BUNIT|parsnips).*MJy/sr"):
         Observation.from_fits(path)
 
 
-def test_a_missing_pixel_area_is_an_error(tmp_path: Path, frames: np.ndarray) -> None:
-    with pytest.raises(UnitError, match=r"area\.fits.*PIXAR_A2"):
-        Observation.from_fits(calints(tmp_path / "area.fits", frames, PIXAR_A2=None))
-
-
-def test_an_integration_without_a_good_pixel_is_left_out_and_named(
-    tmp_path: Path, frames: np.ndarray
-) -> None:
+def test_an_integration_without_a_good_pixel_is_left_out_and_named(tmp_path, frames):
     quality = np.zeros(frames.shape, dtype=np.uint32)
     quality[1] = 1
     got = Observation.from_fits(calints(tmp_path / "half.fits", frames, quality=quality))
@@ -209,7 +123,7 @@ def test_an_integration_without_a_good_pixel_is_left_out_and_named(
             Observation.from_fits(path, every_integration=every)
 
 
-def test_a_file_without_frames_is_an_error(tmp_path: Path, frames: np.ndarray) -> None:
+def test_a_file_without_frames_is_an_error(tmp_path, frames):
     path = calints(tmp_path / "empty.fits", frames)
     with fits.open(path) as hdus:
         cut = [fits.ImageHDU(None, hdu.header, name=hdu.name) for hdu in hdus[1:]]
@@ -219,13 +133,8 @@ def test_a_file_without_frames_is_an_error(tmp_path: Path, frames: np.ndarray) -
         Observation.from_fits(path)
 
 
-# -- arrays ----------------------------------------------------------------------------------
-
-
 @pytest.mark.hard
-def test_arrays_of_any_kind_equal_float64_copies_and_stay_as_they_are(
-    tmp_path: Path, frames: np.ndarray
-) -> None:
+def test_arrays_of_any_kind_equal_float64_copies_and_stay_as_they_are(tmp_path, frames):
     plain = frames.astype(np.float64)
     expected = Observation.from_arrays(plain, plain + 1, pixelscale=0.06)
     big = plain.astype(">f8")
@@ -240,7 +149,7 @@ def test_arrays_of_any_kind_equal_float64_copies_and_stay_as_they_are(
 
 
 @pytest.mark.hard
-def test_bad_pixels_become_zero_in_the_copy_only(frames: np.ndarray) -> None:
+def test_bad_pixels_become_zero_in_the_copy_only(frames):
     data, error = frames.astype(np.float64), np.ones(frames.shape)
     data[0, 0, 1], data[0, 0, 2] = np.nan, np.inf
     error[0, 0, 3], error[0, 0, 4], error[0, 0, 5] = 0.0, -1.0, np.nan
@@ -256,24 +165,16 @@ def test_bad_pixels_become_zero_in_the_copy_only(frames: np.ndarray) -> None:
     assert (got.error[0, 0, 1:7] == 1).all()
 
 
-def test_masked_arrays_mask(frames: np.ndarray) -> None:
-    mask = np.zeros(frames.shape, dtype=bool)
-    mask[1, 3, 4] = True
-    masked = np.ma.masked_array(frames, mask)
-    got = Observation.from_arrays(masked, np.ones(frames.shape), pixelscale=0.06)
-    np.testing.assert_array_equal(got.valid, ~mask)
-
-
 @pytest.mark.parametrize(
     "shape", [(0, 8, 10), (8,), (1, 2, 8, 10), (2, 0, 10)], ids=["none", "1d", "4d", "no rows"]
 )
-def test_data_that_are_no_frames_are_refused(shape: tuple[int, ...]) -> None:
+def test_data_that_are_no_frames_are_refused(shape):
     with pytest.raises(ShapeError, match="data: got shape") as caught:
         Observation.from_arrays(np.ones(shape), np.ones(shape), pixelscale=0.06)
     assert str(shape) in str(caught.value)
 
 
-def test_arrays_that_do_not_go_together_are_refused(frames: np.ndarray) -> None:
+def test_arrays_that_do_not_go_together_are_refused(frames):
     ones = np.ones(frames.shape)
     with pytest.raises(ShapeError, match=r"error: got shape \(1, 8, 10\).*\(2, 8, 10\)"):
         Observation.from_arrays(frames, ones[0], pixelscale=0.06)
@@ -287,22 +188,7 @@ def test_arrays_that_do_not_go_together_are_refused(frames: np.ndarray) -> None:
         Observation.from_arrays(frames, ones, unit="parsnips", pixelscale=0.06)
 
 
-def test_quantities_are_converted_or_refused(frames: np.ndarray) -> None:
-    ones = np.ones(frames.shape)
-    got = Observation.from_arrays(
-        frames * u.Jy / u.sr, ones * u.mJy / u.sr, unit="MJy/sr", pixelscale=62.4 * u.mas
-    )
-    np.testing.assert_allclose(got.data, frames * 1e-6, rtol=1e-6)
-    np.testing.assert_allclose(got.error, 1e-9, rtol=1e-6)
-    assert got.pixelscale == pytest.approx((0.0624, 0.0624), rel=1e-12)
-    with pytest.raises(UnitError, match="data"):
-        Observation.from_arrays(frames * u.s, ones, unit="photon", pixelscale=0.06)
-
-
-# -- cut-outs --------------------------------------------------------------------------------
-
-
-def test_a_cutout_is_whole_pixels_about_the_star(frames: np.ndarray) -> None:
+def test_a_cutout_is_whole_pixels_about_the_star(frames):
     observation = Observation.from_arrays(
         frames, frames + 1, pixelscale=0.06, center=[[5.0, 4.0], [6.2, 3.9]]
     )
@@ -318,7 +204,7 @@ def test_a_cutout_is_whole_pixels_about_the_star(frames: np.ndarray) -> None:
     assert even.shape == (4, 4)
 
 
-def test_a_cutout_that_sticks_out_is_refused(frames: np.ndarray) -> None:
+def test_a_cutout_that_sticks_out_is_refused(frames):
     observation = Observation.from_arrays(
         frames, frames + 1, pixelscale=0.06, center=(1.0, 4.0), name="edge"
     )
@@ -327,10 +213,7 @@ def test_a_cutout_that_sticks_out_is_refused(frames: np.ndarray) -> None:
         observation.cutout(5)
 
 
-# -- means -----------------------------------------------------------------------------------
-
-
-def test_combined_is_the_mean_of_valid_pixels_weighted_by_frame() -> None:
+def test_combined_is_the_mean_of_valid_pixels_weighted_by_frame():
     data = np.array([[[1.0, 2.0, 3.0]], [[5.0, 8.0, 9.0]]])
     error = np.array([[[1.0, 1.0, 2.0]], [[2.0, 1.0, 2.0]]])
     valid = np.array([[[True, False, False]], [[True, True, False]]])
@@ -348,7 +231,7 @@ def test_combined_is_the_mean_of_valid_pixels_weighted_by_frame() -> None:
     np.testing.assert_array_equal(valid_somewhere.position_angles, [10.0])
 
 
-def test_the_mean_of_faint_frames_is_not_biased() -> None:
+def test_the_mean_of_faint_frames_is_not_biased():
     """With weights from every pixel's own counts, it is 2.5 standard deviations too low."""
     counts = np.random.default_rng(7).poisson(5.0, (400, 20, 20)).astype(float)
     error = np.sqrt(np.maximum(counts, 1.0))
@@ -359,28 +242,7 @@ def test_the_mean_of_faint_frames_is_not_biased() -> None:
     assert 0.9 < pulls.std() < 1.1
 
 
-def test_combined_of_one_frame_is_that_frame(frames: np.ndarray) -> None:
-    one = Observation.from_arrays(frames[0], frames[0] + 1, pixelscale=0.06)
-    np.testing.assert_allclose(one.combined().data, one.data, rtol=1e-14)
-    np.testing.assert_allclose(one.combined().error, one.error, rtol=1e-14)
-
-
-# -- real frames -----------------------------------------------------------------------------
-
-
-def test_the_real_frames_are_read(shared_data: Path) -> None:
-    got = Observation.from_fits(shared_data / "hip65426_f444w_calints.fits.gz")
-    assert got.data.shape == (2, 320, 320)
-    assert got.filter == "F444W"
-    assert got.unit == u.MJy / u.sr
-    assert got.pixelscale[0] == pytest.approx(0.0624, rel=0.01)
-    # The brightest pixel of the occulted star lies within a beam of its position.
-    small = got.combined().cutout(41)
-    y, x = np.unravel_index((small.data * small.valid)[0].argmax(), small.shape)
-    assert np.hypot(*(np.array([x, y]) - small.center[0])) < 12
-
-
-def test_frames_of_another_instrument_are_refused_before_a_fit() -> None:
+def test_frames_of_another_instrument_are_refused_before_a_fit():
     ones = np.ones((8, 8))
     header = fits.Header({"INSTRUME": "MIRI"})
     frame = Observation.from_arrays(ones, ones, pixelscale=0.11, filter="F444W", header=header)
@@ -388,7 +250,7 @@ def test_frames_of_another_instrument_are_refused_before_a_fit() -> None:
         dr.model_for(frame)
 
 
-def test_a_model_larger_than_the_frames_is_refused_in_terms_of_pixels() -> None:
+def test_a_model_larger_than_the_frames_is_refused_in_terms_of_pixels():
     ones = np.ones((32, 40))
     frame = Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
     with pytest.raises(ShapeError, match=r"600 x 600 pixels do not fit into 40 x 32\. Choose a"):
@@ -400,7 +262,7 @@ def test_a_model_larger_than_the_frames_is_refused_in_terms_of_pixels() -> None:
     [("F250M", "MASKA335R"), ("F356W", "MASKA335R"), ("F444W", "MASKA335R"),
      ("F356W", "MASKA430R")],
 )  # fmt: skip
-def test_few_cells_of_the_occulter_are_enough_for_a_round_mask(name: str, mask: str) -> None:
+def test_few_cells_of_the_occulter_are_enough_for_a_round_mask(name, mask):
     """Star and planet against four cells per lambda/D; one cell per pixel at all wavelengths."""
     header = fits.Header({"INSTRUME": "NIRCAM", "CORONMSK": mask, "PUPIL": "MASKRND"})
     ones = np.ones((40, 40))

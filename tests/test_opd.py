@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,18 +35,18 @@ NPIX = 96
 
 
 @pytest.fixture(scope="module")
-def pupil() -> np.ndarray:
+def pupil():
     return jwst_pupil(NPIX).numpy() > 0.5
 
 
 @pytest.fixture(scope="module")
-def opd() -> np.ndarray:
+def opd():
     array = random_opd(5, npix=NPIX).data
     array.setflags(write=False)
     return array
 
 
-def write(path: Path, data: np.ndarray, unit: str | None = "m", **header: object) -> Path:
+def write(path, data, unit="m", **header):
     hdu = fits.PrimaryHDU(data)
     if unit is not None:
         hdu.header["BUNIT"] = unit
@@ -58,9 +56,6 @@ def write(path: Path, data: np.ndarray, unit: str | None = "m", **header: object
     return path
 
 
-# -- units -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("unit", "size"),
     [
@@ -68,24 +63,12 @@ def write(path: Path, data: np.ndarray, unit: str | None = "m", **header: object
         ("nm", 1e9), ("nanometers", 1e9), ("Meters", 1.0),
     ],
 )  # fmt: skip
-def test_files_in_any_unit_give_the_same_metres(
-    tmp_path: Path, opd: np.ndarray, unit: str, size: float
-) -> None:
+def test_files_in_any_unit_give_the_same_metres(tmp_path, opd, unit, size):
     got = read_opd(write(tmp_path / "map.fits", opd * size, unit))
     np.testing.assert_allclose(got.data, opd, rtol=1e-14, atol=1e-24)
 
 
-@pytest.mark.hard
-def test_quantities_in_any_unit_give_the_same_image(opd: np.ndarray) -> None:
-    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=12)
-    expected = model(opd)
-    for value in (opd * u.m, opd * 1e6 * u.um, opd * 1e9 * u.nm):
-        torch.testing.assert_close(model(value), expected, rtol=1e-9, atol=1e-20)
-        torch.testing.assert_close(model(as_opd_map(value).data), expected, rtol=1e-9, atol=1e-20)
-    assert not torch.allclose(model(opd * 1.01), expected, rtol=1e-3, atol=0)
-
-
-def test_a_file_without_a_unit_asks_for_one_and_takes_it(tmp_path: Path, opd: np.ndarray) -> None:
+def test_a_file_without_a_unit_asks_for_one_and_takes_it(tmp_path, opd):
     path = write(tmp_path / "wss.fits", opd * 1e6, None)
     with pytest.raises(UnitError, match=r"wss\.fits.*BUNIT.*unit='m'.*'um', 'nm'"):
         read_opd(path)
@@ -94,7 +77,7 @@ def test_a_file_without_a_unit_asks_for_one_and_takes_it(tmp_path: Path, opd: np
 
 
 @pytest.mark.parametrize("unit", ["s", "furlongs per fortnight", "rad"])
-def test_a_unit_that_is_no_length_is_refused(tmp_path: Path, opd: np.ndarray, unit: str) -> None:
+def test_a_unit_that_is_no_length_is_refused(tmp_path, opd, unit):
     with pytest.raises(UnitError, match=rf"map\.fits.*{unit}.*length"):
         read_opd(write(tmp_path / "map.fits", opd, unit))
     with pytest.raises(UnitError, match="opd"):
@@ -106,8 +89,8 @@ def test_a_unit_that_is_no_length_is_refused(tmp_path: Path, opd: np.ndarray, un
     ("size", "likely"), [(1e9, "nm"), (1e6, "um"), (1e3, "mm"), (1e-3, None), (1e12, None)]
 )
 def test_an_implausible_rms_warns_and_names_the_unit_that_would_do(
-    tmp_path: Path, opd: np.ndarray, pupil: np.ndarray, size: float, likely: str | None
-) -> None:
+    tmp_path, opd, pupil, size, likely
+):
     rms = (opd * size)[pupil].std()
     for call in (as_opd_map, lambda a: read_opd(write(tmp_path / "map.fits", a))):
         with pytest.warns(DiffrenderWarning, match="not plausible") as caught:
@@ -121,11 +104,7 @@ def test_an_implausible_rms_warns_and_names_the_unit_that_would_do(
         np.testing.assert_allclose(got.data, opd * size, rtol=1e-15)
 
 
-def test_a_flat_wavefront_is_plausible() -> None:
-    assert not as_opd_map(np.zeros((NPIX, NPIX))).data.any()
-
-
-def test_flat_stands_for_a_flat_wavefront(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flat_stands_for_a_flat_wavefront(tmp_path, monkeypatch):
     # A folder of that name does not change it.
     (tmp_path / "flat").mkdir()
     monkeypatch.chdir(tmp_path)
@@ -138,13 +117,8 @@ def test_flat_stands_for_a_flat_wavefront(tmp_path: Path, monkeypatch: pytest.Mo
     assert not starting_opd(DiffrenderSettings(opd="flat"), None).data.any()
 
 
-# -- holes -----------------------------------------------------------------------------------
-
-
 @pytest.mark.hard
-def test_nan_inside_the_pupil_is_counted_and_located(
-    tmp_path: Path, opd: np.ndarray, pupil: np.ndarray
-) -> None:
+def test_nan_inside_the_pupil_is_counted_and_located(tmp_path, opd, pupil):
     bad = opd.copy()
     assert pupil[30, 40]
     assert pupil[70, 60]
@@ -157,33 +131,14 @@ def test_nan_inside_the_pupil_is_counted_and_located(
         read_opd(write(tmp_path / "holes.fits", bad))
 
 
-def test_nan_outside_the_pupil_becomes_zero(
-    tmp_path: Path, opd: np.ndarray, pupil: np.ndarray
-) -> None:
+def test_nan_outside_the_pupil_becomes_zero(tmp_path, opd, pupil):
     holes = np.where(pupil, opd, np.nan)
     for got in (as_opd_map(holes), read_opd(write(tmp_path / "outside.fits", holes))):
         np.testing.assert_array_equal(got.data[pupil], opd[pupil])
         assert not got.data[~pupil].any()
 
 
-# -- files -----------------------------------------------------------------------------------
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("percent", [25, 50, 99])
-@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
-def test_a_truncated_map_is_an_error_that_names_it(
-    tmp_path: Path, opd: np.ndarray, percent: int, suffix: str
-) -> None:
-    path = write(tmp_path / f"map{suffix}", opd)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    for call in (read_opd, as_opd_map):
-        with pytest.raises(CorruptFileError, match=r"map\.fits"):
-            call(path)
-
-
-def test_the_first_image_is_taken_unless_another_is_named(tmp_path: Path, opd: np.ndarray) -> None:
+def test_the_first_image_is_taken_unless_another_is_named(tmp_path, opd):
     path = tmp_path / "many.fits"
     images = [fits.ImageHDU(k * opd, name=f"STEP{k}") for k in (1, 2)]
     for image in images:
@@ -197,7 +152,7 @@ def test_the_first_image_is_taken_unless_another_is_named(tmp_path: Path, opd: n
             read_opd(path, extension=missing)
 
 
-def test_a_file_without_a_map_is_refused(tmp_path: Path, opd: np.ndarray) -> None:
+def test_a_file_without_a_map_is_refused(tmp_path, opd):
     with pytest.raises(CorruptFileError, match=r"cube\.fits.*two-dimensional"):
         read_opd(write(tmp_path / "cube.fits", np.stack([opd, opd])))
     with pytest.raises(CorruptFileError, match="nowhere"):
@@ -205,9 +160,7 @@ def test_a_file_without_a_map_is_refused(tmp_path: Path, opd: np.ndarray) -> Non
 
 
 @pytest.mark.parametrize("name", ["OPD", "opdmap", "WFE", "Wavefront"])
-def test_a_map_behind_the_pupil_is_taken_by_its_name(
-    tmp_path: Path, opd: np.ndarray, name: str
-) -> None:
+def test_a_map_behind_the_pupil_is_taken_by_its_name(tmp_path, opd, name):
     path = tmp_path / "two.fits"
     images = [fits.ImageHDU(opd, name=name), fits.ImageHDU((opd != 0) * 1.0, name="PUPIL")]
     images[0].header["BUNIT"] = "m"
@@ -226,20 +179,14 @@ def test_a_map_behind_the_pupil_is_taken_by_its_name(
         (lambda opd: (jwst_pupil(len(opd)).numpy() > 0.999) * 1.0, "values 0 and 1,"),
     ],
 )
-def test_a_mask_or_a_constant_is_no_wavefront(
-    tmp_path: Path,
-    opd: np.ndarray,
-    change: Callable[[np.ndarray], np.ndarray],
-    values: str,
-    unit: str | None,
-) -> None:
+def test_a_mask_or_a_constant_is_no_wavefront(tmp_path, opd, change, values, unit):
     path = write(tmp_path / "mask.fits", change(opd), unit)
     with pytest.raises(CorruptFileError, match=rf"mask\.fits.*no wavefront.*{values}.*extension="):
         read_opd(path)
 
 
 @pytest.mark.parametrize("shape", [(2, 16, 16), (16, 16)])
-def test_science_frames_are_no_map(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_science_frames_are_no_map(tmp_path, shape):
     path = tmp_path / "jw01_nrcalong_calints.fits"
     primary, frames = fits.PrimaryHDU(), fits.ImageHDU(np.ones(shape), name="SCI")
     primary.header["EXP_TYPE"] = "NRC_CORON"
@@ -249,19 +196,7 @@ def test_science_frames_are_no_map(tmp_path: Path, shape: tuple[int, ...]) -> No
         read_opd(path)
 
 
-@pytest.mark.slow
-def test_stpsfs_own_files_are_read(tmp_path: Path) -> None:
-    """An OPD in metres in the primary HDU, with stpsf's keywords: nothing is converted."""
-    from stpsf_data import make_stpsf_data
-
-    folder = make_stpsf_data(tmp_path / "data", npix=NPIX)
-    got = read_opd(folder / "JWST_OTE_OPD_cycle1_example_2022-07-30.fits")
-    inside = jwst_pupil(NPIX).numpy() > 0.999
-    assert got.shape == (NPIX, NPIX)
-    assert 4e-8 < got.data[inside].std() < 9e-8
-
-
-def test_a_map_that_is_not_square_is_refused(tmp_path: Path, opd: np.ndarray) -> None:
+def test_a_map_that_is_not_square_is_refused(tmp_path, opd):
     with pytest.raises(ShapeError, match=r"map\.fits.*\(96, 90\).*square"):
         read_opd(write(tmp_path / "map.fits", opd[:, :90]))
     for shape in ((96, 90), (96,), (2, 96, 96)):
@@ -269,10 +204,9 @@ def test_a_map_that_is_not_square_is_refused(tmp_path: Path, opd: np.ndarray) ->
             as_opd_map(np.zeros(shape))
 
 
-def test_date_name_and_hash_are_kept(tmp_path: Path, opd: np.ndarray) -> None:
+def test_date_name_and_hash_are_kept(tmp_path, opd):
     path = write(tmp_path / "dated.fits", opd, DATE_OBS="2022-08-11T01:02:03")
     got = read_opd(path)
-    assert got.date is not None
     assert got.date.isot == "2022-08-11T01:02:03.000"
     assert got.name == "dated.fits"
     assert got.sha256 == sha256(path)
@@ -281,11 +215,8 @@ def test_date_name_and_hash_are_kept(tmp_path: Path, opd: np.ndarray) -> None:
     assert as_opd_map(opd).sha256 == hashlib.sha256(opd.tobytes()).hexdigest()
 
 
-# -- arrays of all kinds ---------------------------------------------------------------------
-
-
 @pytest.mark.hard
-def test_every_kind_of_array_equals_a_float64_copy(tmp_path: Path, opd: np.ndarray) -> None:
+def test_every_kind_of_array_equals_a_float64_copy(tmp_path, opd):
     steps = np.round(opd / 1e-11).astype(np.int16)
     scaled = fits.PrimaryHDU(steps)
     scaled.header["BSCALE"], scaled.header["BUNIT"] = 1e-11, "m"
@@ -311,27 +242,7 @@ def test_every_kind_of_array_equals_a_float64_copy(tmp_path: Path, opd: np.ndarr
     )
 
 
-def test_the_input_is_never_modified_nor_shared(opd: np.ndarray, pupil: np.ndarray) -> None:
-    given = np.where(pupil, opd, np.nan)
-    before = given.copy()
-    as_opd_map(given).data[:] = 1.0
-    np.testing.assert_array_equal(given, before)
-    quantity = given * 1e9 * u.nm
-    as_opd_map(quantity).data[:] = 1.0
-    np.testing.assert_array_equal(quantity.value, before * 1e9)
-
-
-def test_a_map_is_an_array_to_numpy(opd: np.ndarray) -> None:
-    map_ = as_opd_map(opd)
-    assert map_.shape == (NPIX, NPIX)
-    np.testing.assert_array_equal(np.asarray(map_), opd)
-    assert np.asarray(map_, dtype=np.float32).dtype == np.float32
-
-
-# -- sampling --------------------------------------------------------------------------------
-
-
-def test_resampling_keeps_a_plane_and_its_orientation() -> None:
+def test_resampling_keeps_a_plane_and_its_orientation():
     coarse, fine = (PupilGrid.full(n) for n in (48, 144))
     plane = (3 * fine.x[None, :] - 2 * fine.y[:, None]).numpy()
     expected = (3 * coarse.x[None, :] - 2 * coarse.y[:, None]).numpy()
@@ -346,7 +257,7 @@ def test_resampling_keeps_a_plane_and_its_orientation() -> None:
 
 
 @pytest.mark.parametrize("given", [48, 96, 130, 192])
-def test_a_model_takes_maps_of_any_size(given: int) -> None:
+def test_a_model_takes_maps_of_any_size(given):
     model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=12)
     map_ = random_opd(5, npix=given)
     wanted = model(torch.from_numpy(resample(map_.data, NPIX)))
@@ -363,7 +274,7 @@ def test_a_model_takes_maps_of_any_size(given: int) -> None:
         assert not torch.allclose(model(other.copy()), wanted, rtol=1e-3, atol=0)
 
 
-def test_a_model_refuses_what_it_cannot_resample(tmp_path: Path) -> None:
+def test_a_model_refuses_what_it_cannot_resample(tmp_path):
     model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=12)
     with pytest.raises(ShapeError, match=r"tensor of shape \(48, 48\).*96.*opd\.numpy\(\)"):
         model(torch.zeros(48, 48, requires_grad=True))
@@ -374,21 +285,14 @@ def test_a_model_refuses_what_it_cannot_resample(tmp_path: Path) -> None:
         model(tmp_path / "map.fits")
 
 
-def test_a_map_shows_where_it_comes_from_and_not_its_values(opd: np.ndarray) -> None:
-    assert repr(as_opd_map(opd)) == "OPDMap(date=None, name='array', aperture='')"
-
-
-def test_resampling_to_fewer_pixels_takes_means(opd: np.ndarray) -> None:
+def test_resampling_to_fewer_pixels_takes_means(opd):
     np.testing.assert_allclose(
         resample(opd, 32), opd.reshape(32, 3, 32, 3).mean(axis=(1, 3)), rtol=1e-12, atol=1e-22
     )
     assert resample(opd, NPIX) is opd
 
 
-# -- drift -----------------------------------------------------------------------------------
-
-
-def test_random_drift_grows_in_proportion_to_time() -> None:
+def test_random_drift_grows_in_proportion_to_time():
     day = random_drift(3, 24.0, npix=NPIX).data
     for hours in (-6.0, 0.0, 40.0, 240.0):
         np.testing.assert_allclose(
@@ -396,10 +300,7 @@ def test_random_drift_grows_in_proportion_to_time() -> None:
         )
 
 
-# -- generators ------------------------------------------------------------------------------
-
-
-def weighted(map_: np.ndarray) -> tuple[float, float]:
+def weighted(map_):
     """Mean and rms over the pupil."""
     weight = jwst_pupil(map_.shape[0]).numpy()
     weight = weight / weight.sum()
@@ -407,10 +308,9 @@ def weighted(map_: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(
-    "seed",
-    [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(77, marks=pytest.mark.slow)],
+    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(77, marks=pytest.mark.slow)]
 )
-def test_random_opd_has_the_rms_that_was_asked_for_and_no_piston(seed: int) -> None:
+def test_random_opd_has_the_rms_that_was_asked_for_and_no_piston(seed):
     for rms in (66e-9, 10e-9):
         mean, got = weighted(random_opd(seed, npix=NPIX, rms=rms).data)
         assert got == pytest.approx(rms, rel=1e-6)
@@ -420,7 +320,7 @@ def test_random_opd_has_the_rms_that_was_asked_for_and_no_piston(seed: int) -> N
 
 
 @pytest.mark.hard
-def test_the_same_seed_gives_the_same_bits_and_another_seed_another_wavefront() -> None:
+def test_the_same_seed_gives_the_same_bits_and_another_seed_another_wavefront():
     first, again = random_opd(5, npix=NPIX), random_opd(5, npix=NPIX)
     assert first.data.tobytes() == again.data.tobytes()
     assert first.sha256 == again.sha256
@@ -431,7 +331,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_another_wavefront() 
     assert "seed=5" in first.name
 
 
-def test_the_same_seed_gives_the_same_wavefront_at_any_sampling() -> None:
+def test_the_same_seed_gives_the_same_wavefront_at_any_sampling():
     pupil = jwst_pupil(128).numpy() > 0.999
     coarse = random_opd(4, npix=128).data
     for npix in (256, 512):
@@ -441,12 +341,8 @@ def test_the_same_seed_gives_the_same_wavefront_at_any_sampling() -> None:
         assert np.corrcoef(fine[pupil], coarse[pupil])[0, 1] > 0.998
 
 
-def test_there_is_light_nowhere_but_in_the_pupil() -> None:
-    assert not random_opd(1, npix=NPIX).data[jwst_pupil(NPIX).numpy() == 0].any()
-
-
 @pytest.mark.slow
-def test_segments_carry_the_share_of_the_variance_that_was_measured() -> None:
+def test_segments_carry_the_share_of_the_variance_that_was_measured():
     """24 % of the wavefront, 62 % of its drift.
 
     Rigid motions also fit some of the texture, the same share p of it on average: what they
@@ -457,7 +353,7 @@ def test_segments_carry_the_share_of_the_variance_that_was_measured() -> None:
     design = segments.modes(PupilGrid.full(NPIX), 0, len(segments)).flatten(1)[:, inside].T.numpy()
     projector = np.linalg.qr(design)[0]
 
-    def left_over(map_: np.ndarray) -> float:
+    def left_over(map_):
         values = map_.ravel()[inside]
         rest = values - projector @ (projector.T @ values)
         return float((rest**2).sum() / (values**2).sum())
@@ -469,10 +365,7 @@ def test_segments_carry_the_share_of_the_variance_that_was_measured() -> None:
     assert 0.5 < still < 0.76
 
 
-# -- measured maps ---------------------------------------------------------------------------
-
-
-def test_the_measured_pair_has_the_known_rms_and_drift(shared_data: Path) -> None:
+def test_the_measured_pair_has_the_known_rms_and_drift(shared_data):
     first, second = (read_opd(shared_data / f"opd_2022-08-{day}.fits.gz") for day in (11, 14))
     pupil = jwst_pupil(1024).numpy() > 0.5
     assert first.shape == (1024, 1024)

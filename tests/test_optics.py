@@ -9,37 +9,29 @@ import pytest
 import torch
 from astropy import units as u
 
-from pyklip_diffrender.errors import (
-    IncompatibleSetupError,
-    NonFiniteError,
-    ShapeError,
-    UnitError,
-)
+from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.instrument.masks import FILTERS, MASKS
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.optics.planes import MatrixFourier
-from pyklip_diffrender.optics.point_sources import PointSources
-from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
 from pyklip_diffrender.wavefront.opd import random_opd
 
 WAVELENGTH = 4.5e-6
 
 
-def small(**changes: object) -> OpticalSystem:
+def small(**changes):
     settings = {"monochromatic": WAVELENGTH, "npix": 96, "fov_pixels": 24, **changes}
-    return nircam_coronagraph("F444W", **settings)  # type: ignore[arg-type]
+    return nircam_coronagraph("F444W", **settings)
 
 
 @pytest.fixture(scope="module")
-def opd() -> torch.Tensor:
+def opd():
     return torch.from_numpy(random_opd(5, npix=96).data)
 
 
-def test_light_is_conserved_without_masks(opd: torch.Tensor) -> None:
+def test_light_is_conserved_without_masks(opd):
     """On a field of one period of the transform, the image holds all of the pupil's light."""
     model = small(image_mask=None, pupil_mask=None, si_wfe=False)
     period = WAVELENGTH / (JWST_DIAMETER / 96) / ARCSEC
@@ -49,14 +41,14 @@ def test_light_is_conserved_without_masks(opd: torch.Tensor) -> None:
     assert float(model(opd).sum()) < 1.0
 
 
-def test_the_coronagraph_never_makes_light(opd: torch.Tensor) -> None:
+def test_the_coronagraph_never_makes_light(opd):
     open_sum = float(small(image_mask=None, pupil_mask=None)(opd).sum())
     stopped = float(small(image_mask=None)(opd).sum())
     occulted = float(small()(opd).sum())
     assert occulted < 0.1 * stopped < stopped < open_sum
 
 
-def test_a_source_at_positive_offset_appears_at_positive_offset() -> None:
+def test_a_source_at_positive_offset_appears_at_positive_offset():
     model = small(image_mask=None, fov_pixels=31)
     scale = model.detector.pixelscale[0]
     image = model(None, (6 * scale, -4 * scale)).numpy()
@@ -64,9 +56,7 @@ def test_a_source_at_positive_offset_appears_at_positive_offset() -> None:
 
 
 @pytest.mark.parametrize("mask", ["MASK335R", None])
-def test_detector_shift_moves_the_image_and_nothing_else(
-    mask: str | None, opd: torch.Tensor
-) -> None:
+def test_detector_shift_moves_the_image_and_nothing_else(mask, opd):
     """By the route through the occulter's cells, and by that through the planes."""
     model = small(image_mask=mask)
     scale = model.detector.pixelscale[0]
@@ -74,13 +64,13 @@ def test_detector_shift_moves_the_image_and_nothing_else(
     torch.testing.assert_close(moved[:-2, 3:], model(opd)[2:, :-3], rtol=1e-10, atol=1e-16)
 
 
-def test_blur_is_a_standard_deviation() -> None:
+def test_blur_is_a_standard_deviation():
     """Variances of Gaussians add, to the 1e-6 by which a sampled one differs."""
     scale, width, blur = 0.06, 2.0, 0.09
     detector = small(fov_pixels=33, pixelscale=scale).detector
     x = torch.arange(33, dtype=torch.float64) - 16
 
-    def gaussian(variance: float) -> torch.Tensor:
+    def gaussian(variance):
         profile = torch.exp(-(x**2) / (2 * variance)) / variance**0.5
         return profile[:, None] * profile
 
@@ -90,7 +80,7 @@ def test_blur_is_a_standard_deviation() -> None:
     torch.testing.assert_close(blurred, expected, rtol=0, atol=1e-5 * float(expected.max()))
 
 
-def test_an_opd_tilt_moves_the_star_as_the_convention_says() -> None:
+def test_an_opd_tilt_moves_the_star_as_the_convention_says():
     """exp(+2 pi i OPD / lambda) with y inverted between the pupils: +x and -y for a rising OPD."""
     model = small(image_mask=None, si_wfe=False, fov_pixels=31)
     axis = PupilGrid.full(96).x
@@ -101,7 +91,7 @@ def test_an_opd_tilt_moves_the_star_as_the_convention_says() -> None:
     assert np.unravel_index(in_y.argmax(), in_y.shape) == (15 - 5, 15)
 
 
-def test_shear_and_rectangular_pixels_sample_the_same_image(opd: torch.Tensor) -> None:
+def test_shear_and_rectangular_pixels_sample_the_same_image(opd):
     """Every pixel of a sheared, anisotropic array equals a small array centred on that pixel."""
     model = small(pixelscale=(0.060, 0.065), shear=-0.02, fov_pixels=(9, 11))
     image = model(opd)
@@ -113,7 +103,7 @@ def test_shear_and_rectangular_pixels_sample_the_same_image(opd: torch.Tensor) -
         assert float(single[0, 0]) == pytest.approx(float(image[row, column]), rel=1e-9)
 
 
-def test_oversampled_pixels_are_the_sum_of_their_samples(opd: torch.Tensor) -> None:
+def test_oversampled_pixels_are_the_sum_of_their_samples(opd):
     scale = small().detector.pixelscale[0] / 3
     # By one route: the cells of the other are those that suit the detector.
     fine = small(fov_pixels=72, pixelscale=scale, route="planes")(opd)
@@ -122,7 +112,7 @@ def test_oversampled_pixels_are_the_sum_of_their_samples(opd: torch.Tensor) -> N
     torch.testing.assert_close(coarse, binned, rtol=1e-10, atol=1e-18)
 
 
-def test_broadband_is_the_weighted_sum_of_wavelengths(opd: torch.Tensor) -> None:
+def test_broadband_is_the_weighted_sum_of_wavelengths(opd):
     model = small(monochromatic=None, nlambda=3)
     reference = model.bandpass.mean_wavelength
     total = sum(
@@ -134,7 +124,7 @@ def test_broadband_is_the_weighted_sum_of_wavelengths(opd: torch.Tensor) -> None
     torch.testing.assert_close(model(opd), total, rtol=1e-12, atol=1e-20)
 
 
-def test_batches_equal_single_calls(opd: torch.Tensor) -> None:
+def test_batches_equal_single_calls(opd):
     model = small()
     opds = torch.stack([opd, 2 * opd])
     offsets = torch.tensor([[0.01, 0.0], [0.3, -0.2]], dtype=torch.float64)
@@ -143,14 +133,14 @@ def test_batches_equal_single_calls(opd: torch.Tensor) -> None:
         torch.testing.assert_close(batch[k], model(opds[k], offsets[k]), rtol=1e-10, atol=1e-18)
 
 
-def test_float32_is_close_to_float64(opd: torch.Tensor) -> None:
+def test_float32_is_close_to_float64(opd):
     exact, single = small()(opd), small(dtype=torch.float32)(opd)
     assert single.dtype == torch.float32
     # Seven digits of the field before the occulter, which removes 99 % of the light.
     assert float((single - exact).abs().max() / exact.max()) < 2e-5
 
 
-def test_debug_names_every_plane_in_order(opd: torch.Tensor) -> None:
+def test_debug_names_every_plane_in_order(opd):
     model = small()
     fields = model.debug(opd)
     assert list(fields) == [
@@ -160,15 +150,11 @@ def test_debug_names_every_plane_in_order(opd: torch.Tensor) -> None:
     torch.testing.assert_close(intensity, model(opd), rtol=1e-10, atol=1e-20)
 
 
-# -- values where a call gives none ----------------------------------------------------------
-
 STANDING = {"blur": 0.026 * u.arcsec, "lyot_shift": (-0.013, 0.008), "lyot_rotation": 0.6}
 
 
 @pytest.mark.parametrize("changes", [{}, {"image_mask": None}, {"route": "planes"}], ids=str)
-def test_defaults_are_what_a_call_does_not_give(
-    changes: dict[str, object], opd: torch.Tensor
-) -> None:
+def test_defaults_are_what_a_call_does_not_give(changes, opd):
     plain, model = small(**changes), small(**changes, defaults=STANDING)
     expected = plain(opd, **STANDING)
     assert float((plain(opd) - expected).abs().max()) > 1e-2 * float(expected.max())
@@ -187,7 +173,7 @@ def test_defaults_are_what_a_call_does_not_give(
     torch.testing.assert_close(model(opd, **zero), plain(opd), rtol=1e-9, atol=1e-18)
 
 
-def test_defaults_stay_with_copies_of_another_fidelity(opd: torch.Tensor) -> None:
+def test_defaults_stay_with_copies_of_another_fidelity(opd):
     given = dict(FLIGHT_ALIGNMENT)
     model = small(npix=192, defaults=given)
     given["lyot_rotation"] = 40.0  # The caller's own; the model has a copy.
@@ -199,27 +185,7 @@ def test_defaults_stay_with_copies_of_another_fidelity(opd: torch.Tensor) -> Non
     torch.testing.assert_close(cheap(opd), expected, rtol=0, atol=0)
 
 
-def test_point_sources_see_the_defaults(opd: torch.Tensor) -> None:
-    model, plain = small(defaults=STANDING), small()
-    images = [
-        PointSources(each, opd, values).images([12, 3], [20, 4])
-        for each, values in ((model, {}), (plain, STANDING))
-    ]
-    assert torch.equal(*images)
-
-
-def test_defaults_are_checked() -> None:
-    with pytest.raises(TypeError, match="'lyot_shfit' is not a parameter"):
-        small(defaults={"lyot_shfit": (0.0, 0.0)})
-    with pytest.raises(TypeError, match="'lyot_shift' is not a parameter"):
-        small(pupil_mask=None, defaults=FLIGHT_ALIGNMENT)
-    with pytest.raises(ShapeError, match="expected 2"):
-        small(defaults={"lyot_shift": 0.01})
-    with pytest.raises(UnitError, match="arcsec"):
-        small(defaults={"blur": 1 * u.m})
-
-
-def test_what_is_kept_for_one_position_is_not_used_for_another(opd: torch.Tensor) -> None:
+def test_what_is_kept_for_one_position_is_not_used_for_another(opd):
     """Nor does it hide a derivative: a parameter may be varied after it has stood still."""
     model = small()
     one, other = {"lyot_shift": (0.01, 0.0), "detector_shift": (0.02, 0.01)}, {"lyot_rotation": 1.0}
@@ -241,9 +207,6 @@ def test_what_is_kept_for_one_position_is_not_used_for_another(opd: torch.Tensor
     torch.testing.assert_close(forward, slope, rtol=1e-9, atol=0)
 
 
-# -- the occulter ----------------------------------------------------------------------------
-
-
 # Scale of the profile per arcsec, and radius of half the transmitted light, arcsec: 6 lambda/D at
 # 2.1, 3.35 and 4.3 um (Krist et al. 2009).
 PROFILES = {
@@ -255,7 +218,7 @@ PROFILES = {
 
 @pytest.mark.hard
 @pytest.mark.parametrize("name", PROFILES)
-def test_occulter_complement_keeps_its_digits_near_the_centre(name: str) -> None:
+def test_occulter_complement_keeps_its_digits_near_the_centre(name):
     mpmath = pytest.importorskip("mpmath")
     mask = MASKS[name]
     for r in (0.0, 1e-9, 1e-5, 1e-2, 0.3, 1.0, 0.999 * mask.radius):
@@ -266,14 +229,14 @@ def test_occulter_complement_keeps_its_digits_near_the_centre(name: str) -> None
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_occulter_is_exactly_clear_beyond_its_radius(name: str) -> None:
+def test_occulter_is_exactly_clear_beyond_its_radius(name):
     mask = MASKS[name]
     beyond = torch.tensor([mask.radius * (1 + 1e-12), 4.0, 10.0], dtype=torch.float64)
     assert not mask.complement(beyond, torch.zeros(3)).any()
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_half_of_the_light_passes_where_the_mask_is_named_for(name: str) -> None:
+def test_half_of_the_light_passes_where_the_mask_is_named_for(name):
     """Krist's half width at half maximum is that of the intensity, and rounded to a percent."""
     radius = torch.linspace(0, 1.2, 1201, dtype=torch.float64)
     passed = (1 - MASKS[name].complement(radius, torch.zeros(1))) ** 2
@@ -281,75 +244,7 @@ def test_half_of_the_light_passes_where_the_mask_is_named_for(name: str) -> None
     assert found == pytest.approx(PROFILES[name][1], rel=0.015)
 
 
-@pytest.mark.slow
-@pytest.mark.hard
-def test_a_finer_occulter_changes_less_and_less(opd: torch.Tensor) -> None:
-    exact = small(occulter_sampling=16.0)(opd)
-    errors = [
-        float((small(occulter_sampling=s)(opd) - exact).abs().max() / exact.max())
-        for s in (1.0, 2.0, 4.0, 8.0)
-    ]
-    assert errors == sorted(errors, reverse=True)
-    assert errors[2] < 1e-7
-
-
-# -- derivatives -----------------------------------------------------------------------------
-
-
-@pytest.mark.hard
-def test_transform_and_its_inverse_are_adjoint() -> None:
-    generator = torch.Generator().manual_seed(1)
-    grid = PupilGrid(64, JWST_DIAMETER, (5, 60), (10, 50))
-    x = torch.linspace(-1, 1, 17, dtype=torch.float64) * ARCSEC
-    y = torch.linspace(-2, 1, 13, dtype=torch.float64) * ARCSEC
-    transform = MatrixFourier(grid, x, y, WAVELENGTH, shear=0.1)
-
-    def noise(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, dtype=torch.complex128, generator=generator)
-
-    pupil, image = noise(55, 40), noise(13, 17)
-    left = torch.vdot(image.flatten(), transform.forward(pupil).flatten())
-    back = transform.inverse(image, 1.0) * grid.spacing**2
-    right = torch.vdot(back.flatten(), pupil.flatten())
-    assert abs(left - right) / abs(left) < 1e-10
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("plane", ["MASK335R", "MASKRND", "NIRCam internal WFE", "all"])
-def test_adjoint_identity_of_every_linear_stage(plane: str) -> None:
-    """<A u, v> = <u, A* v>, with A* from automatic differentiation."""
-    generator = torch.Generator().manual_seed(2)
-    model = small()
-    start = model.pupil_field(model.opd(None), WAVELENGTH, {})
-    planes = dict(zip((p.name for p in model.planes), model.planes, strict=True))
-    onto = dict(zip(planes, model.windows({}), strict=True))
-
-    def stage(field: torch.Tensor) -> torch.Tensor:
-        wavefront = type(start)(field, WAVELENGTH, start.grid)
-        if plane == "all":
-            return model.propagate(wavefront, {})
-        return planes[plane].apply(wavefront, {}, onto[plane]).field
-
-    u_ = torch.randn(
-        start.field.shape, dtype=torch.complex128, generator=generator
-    ).requires_grad_()
-    if plane == "NIRCam internal WFE":
-        lyot = planes["MASKRND"].apply(type(start)(u_, WAVELENGTH, start.grid), {}, start.grid)
-
-        def stage(field: torch.Tensor) -> torch.Tensor:
-            wavefront = type(start)(field, WAVELENGTH, lyot.grid)
-            return planes[plane].apply(wavefront, {}, lyot.grid).field
-
-        u_ = lyot.field.detach().requires_grad_()
-    answer = stage(u_)
-    v = torch.randn(answer.shape, dtype=torch.complex128, generator=generator)
-    (adjoint,) = torch.autograd.grad(answer, u_, v)
-    left = torch.vdot(v.flatten(), answer.detach().flatten())
-    right = torch.vdot(adjoint.flatten(), u_.detach().flatten())
-    assert abs(left - right) / abs(left) < 1e-10
-
-
-def start_of(name: str) -> torch.Tensor:
+def start_of(name):
     """A point away from special places for every parameter."""
     entry = parameter(name)
     generator = torch.Generator().manual_seed(len(name))
@@ -360,12 +255,12 @@ def start_of(name: str) -> torch.Tensor:
 
 @pytest.mark.hard
 @pytest.mark.parametrize("name", [p.name for p in OPTICAL_PARAMETERS])
-def test_gradcheck_of_every_parameter(name: str, opd: torch.Tensor) -> None:
+def test_gradcheck_of_every_parameter(name, opd):
     model = small(npix=48, fov_pixels=6)
     coarse = opd.reshape(48, 2, 48, 2).mean(dim=(1, 3))
     unit = parameter(name).prior if name != "blur" else 0.02
 
-    def image(value: torch.Tensor) -> torch.Tensor:
+    def image(value):
         # In units of the parameter's own size, and of the image's peak: numbers of order 1.
         return 1e5 * model(coarse, **{name: value * unit})
 
@@ -374,7 +269,7 @@ def test_gradcheck_of_every_parameter(name: str, opd: torch.Tensor) -> None:
 
 
 @pytest.mark.hard
-def test_gradcheck_of_the_opd() -> None:
+def test_gradcheck_of_the_opd():
     model = small(npix=12, fov_pixels=5)
     opd = torch.from_numpy(random_opd(7, npix=12).data * 1e9).requires_grad_()
     assert torch.autograd.gradcheck(
@@ -385,7 +280,7 @@ def test_gradcheck_of_the_opd() -> None:
 @pytest.mark.hard
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["opd", *(p.name for p in OPTICAL_PARAMETERS)])
-def test_full_size_directional_derivative(name: str) -> None:
+def test_full_size_directional_derivative(name):
     """At 1024 pixels, 80 x 80: reverse mode against a fourth-order finite difference."""
     model = nircam_coronagraph("F444W", monochromatic=WAVELENGTH)
     map_ = torch.from_numpy(random_opd(5).data)
@@ -402,7 +297,7 @@ def test_full_size_directional_derivative(name: str) -> None:
         # Areas of pixels cut by an edge are only once differentiable: a smaller step there.
         step = {"blur": 1e-2, "lyot_shift": 2e-5, "lyot_rotation": 2e-5}.get(name, 1e-3)
 
-    def loss(x: torch.Tensor) -> torch.Tensor:
+    def loss(x):
         image = model(x) if name == "opd" else model(map_, **{name: x})
         return (weight * image).sum()
 
@@ -414,45 +309,28 @@ def test_full_size_directional_derivative(name: str) -> None:
     assert slope == pytest.approx(numeric, rel=1e-7)
 
 
-@pytest.mark.hard
-def test_gradient_at_exact_zeros_of_the_field() -> None:
-    """A dark pixel has a finite gradient: nothing takes a square root or an angle of it."""
-    model = small(npix=32, fov_pixels=8)
-    # Torch warns whenever the mode is on.
-    with pytest.warns(UserWarning, match="Anomaly Detection"):
-        watch = torch.autograd.detect_anomaly(check_nan=True)
-    opd = torch.zeros(32, 32, dtype=torch.float64, requires_grad=True)
-    with watch:
-        (model(opd, (0.0, 0.0)) * 0).sum().backward()
-    assert opd.grad is not None
-    assert not opd.grad.any()
-
-
-# -- wavelengths -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["F444W", "F335M", "F250M", "F182M", "F212N"])
-def test_bandpass_weights_sum_to_one_and_lie_in_the_filter(name: str) -> None:
+def test_bandpass_weights_sum_to_one_and_lie_in_the_filter(name):
     band = filter_bandpass(name, 9)
     assert math.fsum(band.weights) == pytest.approx(1.0, abs=1e-12)
     assert list(band.wavelengths) == sorted(band.wavelengths)
     assert band.mean_wavelength == pytest.approx(float(name[1:4]) * 1e-8, rel=0.05)
 
 
-def test_a_cool_star_is_redder_than_a_hot_one() -> None:
+def test_a_cool_star_is_redder_than_a_hot_one():
     assert (
         filter_bandpass("F444W", 5, 2000.0).mean_wavelength
         > filter_bandpass("F444W", 5, 9000.0).mean_wavelength + 1e-8
     )
 
 
-def test_blackbody_has_wiens_peak() -> None:
+def test_blackbody_has_wiens_peak():
     grid = np.linspace(1e-7, 4e-6, 100_000)
     # Photons per wavelength peak at lambda T = 3.6697e-3 m K.
     assert grid[blackbody(5000.0, grid).argmax()] * 5000 == pytest.approx(3.6697e-3, rel=1e-4)
 
 
-def test_a_given_spectrum_is_used() -> None:
+def test_a_given_spectrum_is_used():
     line = (np.array([3e-6, 4.39e-6, 4.4e-6, 4.41e-6, 6e-6]), np.array([0, 0, 1.0, 0, 0]))
     band = filter_bandpass("F444W", 7, line)
     assert band.mean_wavelength == pytest.approx(4.4e-6, abs=1e-8)
@@ -461,23 +339,18 @@ def test_a_given_spectrum_is_used() -> None:
         filter_bandpass("F444W", 7, (line[0], 0 * line[1]))
 
 
-# -- bad input -------------------------------------------------------------------------------
-
-
 @pytest.mark.hard
 @pytest.mark.parametrize(
     ("name", "mask"), [("F444", "MASK430R"), ("F115W", "MASK210R"), ("nonsense", None)]
 )
-def test_a_filter_that_does_not_go_with_the_coronagraph_is_named_with_those_that_do(
-    name: str, mask: str | None
-) -> None:
+def test_a_filter_that_does_not_go_with_the_coronagraph_is_named_with_those_that_do(name, mask):
     legal = r"F182M.*F212N \(short wave\) or F250M.*F480M \(long wave\)"
     with pytest.raises(IncompatibleSetupError, match=legal) as caught:
         nircam_coronagraph(name, image_mask=mask)
     assert repr(name) in str(caught.value)
 
 
-def test_every_filter_has_a_throughput() -> None:
+def test_every_filter_has_a_throughput():
     for name in FILTERS:
         wavelength, throughput = filter_throughput(name)
         assert (np.diff(wavelength) > 0).all()
@@ -503,29 +376,13 @@ def test_every_filter_has_a_throughput() -> None:
         ({"dtype": torch.float16}, "float32"),
     ],
 )
-def test_impossible_settings_are_refused(changes: dict[str, object], words: str) -> None:
+def test_impossible_settings_are_refused(changes, words):
     with pytest.raises(IncompatibleSetupError, match=words):
         small(**changes)
 
 
-def test_an_opd_of_another_size_says_what_to_do() -> None:
-    """Arrays are resampled; tensors, whose gradients may be wanted, are not."""
-    with pytest.raises(ShapeError, match=r"npix=64"):
-        small()(torch.zeros(64, 64))
-    with pytest.raises(ShapeError, match=r"square"):
-        small()(np.zeros((64, 48)))
-
-
 @pytest.mark.hard
-def test_nan_in_the_opd_is_counted_and_located() -> None:
-    bad = np.zeros((96, 96))
-    bad[3, 7] = bad[50, 50] = np.nan
-    with pytest.raises(NonFiniteError, match=r"2 values.*\(3, 7\)"):
-        small()(bad)
-
-
-@pytest.mark.hard
-def test_units_are_honoured_or_refused(opd: torch.Tensor) -> None:
+def test_units_are_honoured_or_refused(opd):
     model = small()
     in_nm = model(opd.numpy() * 1e9 * u.nm)
     torch.testing.assert_close(in_nm, model(opd), rtol=1e-9, atol=1e-20)
@@ -537,22 +394,7 @@ def test_units_are_honoured_or_refused(opd: torch.Tensor) -> None:
         model(opd, star_offset=[1.0, 2.0] * u.m)
 
 
-def test_unknown_parameters_and_wrong_sizes_are_refused(opd: torch.Tensor) -> None:
-    with pytest.raises(TypeError, match="lyot_shift"):
-        small()(opd, lyot_shfit=(0, 0))
-    with pytest.raises(ShapeError, match="expected 2"):
-        small()(opd, lyot_shift=0.1)
-
-
-@pytest.mark.hard
-def test_inputs_of_any_kind_give_the_same_image_and_stay_unchanged(opd: torch.Tensor) -> None:
-    model = small()
-    array = opd.numpy().astype(">f8")
-    array.setflags(write=False)
-    torch.testing.assert_close(model(array), model(opd), rtol=0, atol=0)
-
-
-def test_an_imaginary_opd_changes_the_amplitude_and_nothing_else(opd: torch.Tensor) -> None:
+def test_an_imaginary_opd_changes_the_amplitude_and_nothing_else(opd):
     """OPD -1j a: the amplitude grows by exp(2 pi a / wavelength) everywhere, the light squared."""
     model = small(image_mask=None)
     gain = 30e-9
@@ -562,7 +404,7 @@ def test_an_imaginary_opd_changes_the_amplitude_and_nothing_else(opd: torch.Tens
 
 
 @pytest.mark.hard
-def test_gradcheck_of_the_amplitude() -> None:
+def test_gradcheck_of_the_amplitude():
     model = small(npix=12, fov_pixels=5)
     opd = torch.from_numpy(random_opd(7, npix=12).data)
     absorbed = torch.full_like(opd, 20.0).requires_grad_()

@@ -10,7 +10,7 @@ import torch
 from pyklip_diffrender.bridges.sampled_planes import Orientation
 
 
-def random(size: int) -> torch.Tensor:
+def random(size):
     """The same numbers in every run."""
     generator = torch.Generator().manual_seed(size)
     return torch.rand(size, size, generator=generator, dtype=torch.float64)
@@ -22,7 +22,7 @@ TURNS = [
 ]
 
 
-def test_there_are_eight() -> None:
+def test_there_are_eight():
     assert len(set(TURNS)) == 8
     assert {first.then(second) for first, second in product(TURNS, TURNS)} == set(TURNS)
     for turn in TURNS:
@@ -32,7 +32,7 @@ def test_there_are_eight() -> None:
 
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("size", [5, 6])
-def test_an_array_follows_its_positions(turn: Orientation, size: int) -> None:
+def test_an_array_follows_its_positions(turn, size):
     array = random(size)
     turned = turn.apply(array)
     middle = (size - 1) / 2
@@ -42,11 +42,11 @@ def test_an_array_follows_its_positions(turn: Orientation, size: int) -> None:
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_a_lattice_turns_as_the_transform_of_a_turned_pupil(turn: Orientation) -> None:
+def test_a_lattice_turns_as_the_transform_of_a_turned_pupil(turn):
     """Turning the pupil turns its power spectrum, whose middle is sample n // 2."""
     pupil = random(8)
 
-    def power(field: torch.Tensor) -> torch.Tensor:
+    def power(field):
         return torch.fft.fftshift(torch.fft.ifft2(field)).abs() ** 2
 
     assert torch.allclose(power(turn.apply(pupil)), turn.apply_to_lattice(power(pupil)))
@@ -54,6 +54,6 @@ def test_a_lattice_turns_as_the_transform_of_a_turned_pupil(turn: Orientation) -
     assert not torch.allclose(power(other), turn.apply_to_lattice(power(pupil)))
 
 
-def test_counter_clockwise_is_from_x_to_y() -> None:
+def test_counter_clockwise_is_from_x_to_y():
     x, y = Orientation.quarter_turns(1).positions(torch.tensor(1.0), torch.tensor(0.0))
     assert (float(x), float(y)) == (0.0, 1.0)

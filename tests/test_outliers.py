@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.refinement import refine_again
 
 SIZE, NPIX, SCENE = 32, 64, 5
@@ -23,7 +22,7 @@ SETTINGS = dr.GaussNewton(
 
 
 @cache
-def model(name: str = "F444W") -> OpticalSystem:
+def model(name="F444W"):
     wavelength = {"F444W": 4.5e-6, "F250M": 2.5e-6}[name]
     return dr.nircam_coronagraph(
         name, monochromatic=wavelength, npix=NPIX, fov_pixels=SIZE, fov_arcsec=None
@@ -31,37 +30,37 @@ def model(name: str = "F444W") -> OpticalSystem:
 
 
 @cache
-def start() -> dr.wavefront.opd.OPDMap:
+def start():
     return dr.random_opd(1, npix=NPIX)
 
 
-def shot(*planets: dr.Planet, seed: int = SCENE, name: str = "F444W") -> dr.Observation:
+def shot(*planets, seed=SCENE, name="F444W"):
     return dr.simulate(model(name), dr.Scene(planets=planets), start(), seed=seed)
 
 
-def spoiled(frame: dr.Observation, sigmas: float) -> dr.Observation:
+def spoiled(frame, sigmas):
     data = frame.data.copy()
     data[0][PIXEL] += sigmas * frame.error[0][PIXEL]
     return replace(frame, data=data)
 
 
-def fitted(*frames: dr.Observation, name: str = "F444W", **changes: object) -> dr.Refinement:
-    settings = replace(SETTINGS, **changes)  # type: ignore[arg-type]
+def fitted(*frames, name="F444W", **changes):
+    settings = replace(SETTINGS, **changes)
     return dr.refine(model(name), list(frames), start(), settings=settings)
 
 
-def left_out(fit: dr.Refinement, k: int = 0) -> list[tuple[int, int]]:
+def left_out(fit, k=0):
     rows, columns = np.nonzero(~fit.frames[k].observation.valid[0])
     return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
 
-def here(*, row: float = PIXEL[0], column: float = PIXEL[1], contrast: float) -> dr.Planet:
+def here(*, row=PIXEL[0], column=PIXEL[1], contrast):
     """A planet at a place on the frame, in pixels."""
     x, y = (np.array([column, row]) - (SIZE - 1) / 2) * np.array(model().detector.pixelscale)
     return dr.Planet.from_offset(contrast, float(x), float(y))
 
 
-def test_a_hot_pixel_is_no_planet() -> None:
+def test_a_hot_pixel_is_no_planet():
     frame = spoiled(shot(), 25.0)
     before = frame.data.copy(), frame.valid.copy()
     fit = fitted(frame)
@@ -72,7 +71,7 @@ def test_a_hot_pixel_is_no_planet() -> None:
     np.testing.assert_array_equal(frame.valid, before[1])
 
 
-def test_the_star_is_fitted_without_a_dead_pixel() -> None:
+def test_the_star_is_fitted_without_a_dead_pixel():
     """One that is 60 sigma too faint raises chi-squared per pixel to 4 if it stays."""
     frame = spoiled(shot(), -60.0)
     fit = fitted(frame)
@@ -83,13 +82,13 @@ def test_the_star_is_fitted_without_a_dead_pixel() -> None:
     assert pulls.std() == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_pixel_that_the_fit_took_for_a_companion() -> None:
+def test_a_pixel_that_the_fit_took_for_a_companion():
     planet = here(contrast=3e-6)
     fit = fitted(spoiled(shot(), 40.0), companions=(planet,))
     assert left_out(fit) == [PIXEL]
 
 
-def test_a_bright_companion_of_the_fit_keeps_its_core() -> None:
+def test_a_bright_companion_of_the_fit_keeps_its_core():
     """Its model is wrong by more than the noise, and its own unknowns explain any source there."""
     planet = here(contrast=1e-4)
     frame = spoiled(shot(planet), 15.0)
@@ -98,7 +97,7 @@ def test_a_bright_companion_of_the_fit_keeps_its_core() -> None:
     assert fit.companions[0, 0] == pytest.approx(1e-4, rel=0.1)
 
 
-def test_a_hot_pixel_on_a_planet_is_left_out() -> None:
+def test_a_hot_pixel_on_a_planet_is_left_out():
     """It would make the planet brighter and move it."""
     planet = here(row=PIXEL[0] + 0.3, column=PIXEL[1] - 0.2, contrast=4e-6)
     frames = [shot(planet), spoiled(shot(planet, seed=SCENE + 1), 25.0)]
@@ -119,20 +118,20 @@ def test_a_hot_pixel_on_a_planet_is_left_out() -> None:
         pytest.param("F250M", (0.25, 0.25), 1e-4, marks=pytest.mark.slow),
     ],
 )
-def test_planets_are_kept(name: str, shift: tuple[float, float], contrast: float) -> None:
+def test_planets_are_kept(name, shift, contrast):
     planet = here(row=PIXEL[0] + shift[0], column=PIXEL[1] + shift[1], contrast=contrast)
     frame, without = shot(planet, name=name), shot(name=name)
     assert ((frame.data - without.data) / frame.error).max() > 8
     assert left_out(fitted(frame, name=name)) == []
 
 
-def test_only_the_frame_that_shows_it_loses_the_pixel() -> None:
+def test_only_the_frame_that_shows_it_loses_the_pixel():
     frames = [spoiled(shot(), 30.0), shot(seed=SCENE + 1)]
     fit = fitted(*frames)
     assert (left_out(fit, 0), left_out(fit, 1)) == ([PIXEL], [])
 
 
-def test_fits_that_go_on_do_not_get_it_back() -> None:
+def test_fits_that_go_on_do_not_get_it_back():
     fit = fitted(spoiled(shot(), 25.0))
     again = refine_again(fit)
     assert left_out(again) == [PIXEL]

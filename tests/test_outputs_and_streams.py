@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
-from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
 
@@ -16,7 +14,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.surveys import execution
 
 
-def link(path: Path, target: Path) -> Path:
+def link(path, target):
     try:
         path.symlink_to(target)
     except OSError:
@@ -24,20 +22,20 @@ def link(path: Path, target: Path) -> Path:
     return path
 
 
-def dangling(folder: Path) -> Path:
+def dangling(folder):
     return link(folder / "out", folder / "nowhere")
 
 
-def inside_dangling(folder: Path) -> Path:
+def inside_dangling(folder):
     return link(folder / "link", folder / "nowhere") / "out"
 
 
-def loop(folder: Path) -> Path:
+def loop(folder):
     link(folder / "other", folder / "out")
     return link(folder / "out", folder / "other")
 
 
-def with_dangling_product(folder: Path) -> Path:
+def with_dangling_product(folder):
     (folder / "out").mkdir()
     link(folder / "out" / "report.html", folder / "nowhere")
     return folder / "out"
@@ -45,9 +43,7 @@ def with_dangling_product(folder: Path) -> Path:
 
 @pytest.mark.parametrize("make", [dangling, inside_dangling, loop, with_dangling_product])
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_links_that_lead_nowhere_are_refused_before_the_fit(
-    tmp_path: Path, make: Any, overwrite: bool
-) -> None:
+def test_links_that_lead_nowhere_are_refused_before_the_fit(tmp_path, make, overwrite):
     output = make(tmp_path)
     with pytest.raises(IncompatibleSetupError, match=r"--output: .* is a link to .*, which does"):
         Run().claim_folder(output, ("report.html",), overwrite)
@@ -56,20 +52,20 @@ def test_links_that_lead_nowhere_are_refused_before_the_fit(
         Run().claim_file(path, overwrite)
 
 
-def test_a_link_to_a_folder_is_taken(tmp_path: Path) -> None:
+def test_a_link_to_a_folder_is_taken(tmp_path):
     (tmp_path / "real").mkdir()
     Run().claim_folder(link(tmp_path / "out", tmp_path / "real"), ("report.html",), False)
     Run().claim_file(tmp_path / "out" / "star.fits", False)
 
 
-def closed() -> io.StringIO:
+def closed():
     stream = io.StringIO()
     stream.close()
     return stream
 
 
 class Broken(io.StringIO):
-    def flush(self) -> None:
+    def flush(self):
         raise OSError("Bad file descriptor")
 
 
@@ -78,9 +74,9 @@ class Broken(io.StringIO):
     "arguments", [["--help"], ["psf", "-o", "no/such/folder/star.fits"], ["nothing"]]
 )
 def test_a_program_without_standard_streams_ends_as_with_them(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stream: Any,
-    arguments: list[str],
-) -> None:  # fmt: skip
+    monkeypatch, capsys, stream,
+    arguments,
+):  # fmt: skip
     expected = main(arguments)
     monkeypatch.setattr(sys, "stdout", stream())
     monkeypatch.setattr(sys, "stderr", stream())
@@ -95,9 +91,7 @@ def test_a_program_without_standard_streams_ends_as_with_them(
         (None, "came from standard input"),
     ],
 )
-def test_a_script_from_standard_input_is_not_told_to_add_a_guard(
-    monkeypatch: pytest.MonkeyPatch, file: str | None, words: str
-) -> None:
+def test_a_script_from_standard_input_is_not_told_to_add_a_guard(monkeypatch, file, words):
     script = ModuleType("__main__")
     script.__file__ = file
     monkeypatch.setitem(sys.modules, "__main__", script)

@@ -28,7 +28,7 @@ SIZES = {"star_offset": 1e-3, "detector_shift": 1e-3, "si_zernikes": 2e-9, "mode
 
 
 @pytest.fixture(scope="module")
-def fit() -> dr.Refinement:
+def fit():
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=36)
     opd = dr.random_opd(1, npix=128)
     planets = (dr.Planet.from_offset(4e-3, *BRIGHT), dr.Planet.from_offset(9e-5, *FAINT))
@@ -39,7 +39,7 @@ def fit() -> dr.Refinement:
     return dr.refine(model, frame, opd, settings=settings)
 
 
-def rates(fit: dr.Refinement, place: tuple[float, float]) -> np.ndarray:
+def rates(fit, place):
     """Displacements of a source by the unknowns, (unknowns, 2), arcsec per unit.
 
     Each unknown is changed in the model, and the change is fitted by flux and place of the source.
@@ -49,7 +49,7 @@ def rates(fit: dr.Refinement, place: tuple[float, float]) -> np.ndarray:
     values = frame.optical_values
     values["star_offset"] = values["star_offset"] + torch.tensor(place, dtype=torch.float64)
 
-    def slope(name: str, component: int) -> np.ndarray:
+    def slope(name, component):
         size = len(basis) if name == "modes" else len(values[name])
         step = torch.zeros(size, dtype=torch.float64)
         step[component] = SIZES[name]
@@ -77,7 +77,7 @@ def rates(fit: dr.Refinement, place: tuple[float, float]) -> np.ndarray:
     return displaced
 
 
-def test_the_star_is_uncertain_by_all_that_moves_light(fit: dr.Refinement) -> None:
+def test_the_star_is_uncertain_by_all_that_moves_light(fit):
     groups = groups_of([fit])
     candidates = Candidates.at(PLACES, [3e-5, 3e-5])
     added = (with_position_of_star(groups, candidates).covariance - candidates.covariance).numpy()
@@ -94,7 +94,7 @@ def test_the_star_is_uncertain_by_all_that_moves_light(fit: dr.Refinement) -> No
     assert (fit.linear.covariance.diagonal()[alone].sqrt().numpy() > 3 * scale.max()).all()
 
 
-def test_candidates_have_the_error_of_the_star(fit: dr.Refinement) -> None:
+def test_candidates_have_the_error_of_the_star(fit):
     search = dr.detect(fit)
     assert search.sources.offsets.numpy() == pytest.approx(np.array([BRIGHT, FAINT]), abs=2e-3)
     groups = groups_of(search.fits)
@@ -113,7 +113,7 @@ def test_candidates_have_the_error_of_the_star(fit: dr.Refinement) -> None:
     np.testing.assert_allclose(stated, factor * search.sources.errors[:, 1].numpy())
 
 
-def test_companions_of_a_fit_are_known_in_the_orientation_of_another(fit: dr.Refinement) -> None:
+def test_companions_of_a_fit_are_known_in_the_orientation_of_another(fit):
     frame = replace(
         fit.frames[0],
         observation=replace(fit.frames[0].observation, position_angles=np.array([20.0])),

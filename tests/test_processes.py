@@ -30,7 +30,7 @@ assert threads == 1 and torch.get_num_threads() == 2
 
 
 @pytest.mark.skipif(not hasattr(os, "register_at_fork"), reason="this system has no fork")
-def test_a_forked_child_computes_after_a_parent_with_two_threads() -> None:
+def test_a_forked_child_computes_after_a_parent_with_two_threads():
     """Threads of the parent do not exist in the child, which would wait for them forever."""
     done = subprocess.run(
         [sys.executable, "-W", "ignore::DeprecationWarning", "-c", SCRIPT],

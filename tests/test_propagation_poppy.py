@@ -6,7 +6,6 @@ import numpy as np
 import poppy_reference as reference
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from pyklip_diffrender.instrument import (
     NIRCAM_LW_PIXELSCALE,
@@ -14,9 +13,7 @@ from pyklip_diffrender.instrument import (
     maskrnd_openings,
     nircam_coronagraph,
 )
-from pyklip_diffrender.optics import OpticalSystem, PupilGrid, polygon_coverage
-
-Array = NDArray[np.float64]
+from pyklip_diffrender.optics import PupilGrid, polygon_coverage
 
 NPIX = 128
 WAVELENGTH = 4.5e-6
@@ -28,15 +25,11 @@ QUICK = (0.6,)
 ANGLE = 0.7
 
 
-def star(separation: float) -> tuple[float, float]:
+def star(separation):
     return separation * np.cos(ANGLE), separation * np.sin(ANGLE)
 
 
-def ours(
-    occulter_sampling: float | None = None,
-    dtype: torch.dtype = torch.float64,
-    route: str = "auto",
-) -> OpticalSystem:
+def ours(occulter_sampling=None, dtype=torch.float64, route="auto"):
     return nircam_coronagraph(
         monochromatic=WAVELENGTH,
         npix=NPIX,
@@ -48,7 +41,7 @@ def ours(
     )
 
 
-def theirs(oversample: int, separation: float) -> Array:
+def theirs(oversample, separation):
     system = reference.coronagraph(
         jwst_pupil(NPIX).numpy(),
         reference.lopsided_opd(NPIX),
@@ -61,7 +54,7 @@ def theirs(oversample: int, separation: float) -> Array:
     return reference.image(system, WAVELENGTH, *star(separation))
 
 
-def error(image: Array, truth: Array) -> float:
+def error(image, truth):
     return float(np.abs(image - truth).max() / truth.max())
 
 
@@ -70,7 +63,7 @@ def error(image: Array, truth: Array) -> float:
     params=[pytest.param(r, marks=() if r in QUICK else pytest.mark.slow) for r in SEPARATIONS],
     ids=lambda r: f"{r} arcsec",
 )
-def converged(request: pytest.FixtureRequest) -> tuple[float, Array]:
+def converged(request):
     separation = request.param
     finest, before = theirs(16, separation), theirs(8, separation)
     assert error(before, finest) < 1e-8, "poppy itself has not converged"
@@ -79,7 +72,7 @@ def converged(request: pytest.FixtureRequest) -> tuple[float, Array]:
 
 @pytest.mark.hard
 @pytest.mark.parametrize("route", ["lattice", "planes"])
-def test_the_default_sampling_has_converged(converged: tuple[float, Array], route: str) -> None:
+def test_the_default_sampling_has_converged(converged, route):
     separation, truth = converged
     image = ours(route=route)(reference.lopsided_opd(NPIX), star_offset=star(separation)).numpy()
     assert error(image, truth) <= 1e-7
@@ -88,7 +81,7 @@ def test_the_default_sampling_has_converged(converged: tuple[float, Array], rout
 @pytest.mark.hard
 @pytest.mark.parametrize("separation", [0.0, 0.6])
 @pytest.mark.parametrize("sampling", [2, 4])
-def test_the_same_samples_give_the_same_image(sampling: int, separation: float) -> None:
+def test_the_same_samples_give_the_same_image(sampling, separation):
     """poppy's cells and ours are the same lattice: only rounding is left, whatever it is worth."""
     model = ours(sampling, route="planes")
     image = model(reference.lopsided_opd(NPIX), star_offset=star(separation)).numpy()
@@ -97,7 +90,7 @@ def test_the_same_samples_give_the_same_image(sampling: int, separation: float) 
 
 
 @pytest.mark.hard
-def test_the_complex_field_is_the_same() -> None:
+def test_the_complex_field_is_the_same():
     """Fields, not only intensities: a fit differentiates them."""
     system = reference.coronagraph(
         jwst_pupil(NPIX).numpy(),
@@ -117,14 +110,7 @@ def test_the_complex_field_is_the_same() -> None:
 
 
 @pytest.mark.hard
-def test_single_precision_is_good_to_a_few_parts_in_ten_thousand() -> None:
+def test_single_precision_is_good_to_a_few_parts_in_ten_thousand():
     truth = ours()(reference.lopsided_opd(NPIX)).numpy()
     image = ours(dtype=torch.float32)(reference.lopsided_opd(NPIX)).numpy()
     assert 1e-9 < error(image, truth) < 5e-4
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("turn", [np.flipud, np.fliplr, np.transpose, np.negative])
-def test_a_turned_wavefront_would_be_noticed(turn: type[np.ufunc]) -> None:
-    truth = theirs(2, 0.0)
-    assert error(ours()(turn(reference.lopsided_opd(NPIX)).copy()).numpy(), truth) > 1e-2

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -12,22 +9,16 @@ from astropy.io import fits
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import jwst_pupil, nircam_coronagraph
-from pyklip_diffrender.optics import OpticalSystem
 
 OPD = 5e-8 * np.random.default_rng(1).standard_normal((64, 64))
 
 
-def model(**changes: Any) -> OpticalSystem:
-    settings: dict[str, Any] = {
-        "monochromatic": 4.5e-6,
-        "npix": 64,
-        "fov_pixels": 20,
-        "oversample": 3,
-    }
+def model(**changes):
+    settings = {"monochromatic": 4.5e-6, "npix": 64, "fov_pixels": 20, "oversample": 3}
     return nircam_coronagraph(**{**settings, **changes})
 
 
-def test_extensions_and_keywords() -> None:
+def test_extensions_and_keywords():
     psf = model().calc_psf(opd=OPD, star_offset=(0.1, 0.2))
     assert [hdu.name for hdu in psf] == ["OVERSAMP", "DET_SAMP"]
     assert psf[0].data.shape == (60, 60)
@@ -43,7 +34,7 @@ def test_extensions_and_keywords() -> None:
     assert psf[0].header["PIXELSCL"] == pytest.approx(0.062424185 / 3)
 
 
-def test_arguments_of_an_instrument_change_the_call(tmp_path: Path) -> None:
+def test_arguments_of_an_instrument_change_the_call(tmp_path):
     path = tmp_path / "psf.fits"
     psf = model().calc_psf(
         outfile=path, nlambda=3, fov_pixels=16, oversample=2, opd=OPD, normalize="last"
@@ -61,7 +52,7 @@ def test_arguments_of_an_instrument_change_the_call(tmp_path: Path) -> None:
     assert np.array_equal(model().calc_psf(opd=OPD, fft_oversample=8)[0].data, same)
 
 
-def test_normalisations() -> None:
+def test_normalisations():
     first = model().calc_psf(opd=OPD)[0].data
     totals = {}
     for name in ("last", "exit_pupil", "none"):
@@ -75,7 +66,7 @@ def test_normalisations() -> None:
         model().calc_psf(normalize="middle")
 
 
-def test_intermediate_fields_come_by_name() -> None:
+def test_intermediate_fields_come_by_name():
     psf, fields = model().calc_psf(opd=OPD, return_intermediates=True)
     assert next(iter(fields)) == "JWST pupil"
     final = fields["detector"].abs() ** 2

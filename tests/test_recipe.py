@@ -5,11 +5,9 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
@@ -18,7 +16,7 @@ FLUX, BACKGROUND = 1e10, 500.0
 
 
 @pytest.fixture
-def recipe(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def recipe(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "examples" / "paper"))
     return importlib.import_module("recipe")
 
@@ -33,7 +31,7 @@ class Small:
 
 
 @pytest.fixture(scope="module")
-def small() -> Small:
+def small():
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=20)
     before, after = (dr.random_opd(seed, npix=64).data for seed in (1, 2))
     counts = np.random.default_rng(3).poisson(FLUX * model(after).numpy() + BACKGROUND)
@@ -43,7 +41,7 @@ def small() -> Small:
     return Small(model, before, frame)
 
 
-def test_the_recipe_lowers_the_mean_absolute_error(recipe: ModuleType, small: Small) -> None:
+def test_the_recipe_lowers_the_mean_absolute_error(recipe, small):
     fit = recipe.adam_recipe(
         small.model, small.frame, small.opd, flux=FLUX, background=BACKGROUND, steps=30
     )
@@ -59,21 +57,7 @@ def test_the_recipe_lowers_the_mean_absolute_error(recipe: ModuleType, small: Sm
     assert np.abs(fit.residual).mean() == pytest.approx(min(fit.losses), rel=1e-10)
 
 
-def test_the_first_step_of_the_recipe_is_against_the_gradient(
-    recipe: ModuleType, small: Small
-) -> None:
-    fit = recipe.adam_recipe(small.model, small.frame, small.opd, flux=FLUX, steps=2)
-    opd = torch.from_numpy(small.opd.copy()).requires_grad_()
-    image = FLUX * small.model(opd)
-    (gradient,) = torch.autograd.grad(
-        (image - torch.from_numpy(small.frame.data[0])).abs().mean(), opd
-    )
-    strong = gradient.abs() > 1e-3 * gradient.abs().max()
-    step = torch.from_numpy(fit.wavefront - small.opd)
-    torch.testing.assert_close(step[strong], -1e-11 * gradient.sign()[strong], rtol=1e-3, atol=0)
-
-
-def test_the_recipe_does_not_see_masked_pixels(recipe: ModuleType, small: Small) -> None:
+def test_the_recipe_does_not_see_masked_pixels(recipe, small):
     valid = np.random.default_rng(4).random(small.frame.shape) > 0.05
     fits = []
     for junk in (0.0, 1e30):

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -14,16 +13,10 @@ from astropy import units as u
 from astropy.table import QTable
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import (
-    Candidates,
-    measured_planet,
-    recover_planets,
-    with_planets,
-)
+from pyklip_diffrender.detection import Candidates, measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.recovery import TOGETHER, _free_place
+from pyklip_diffrender.detection.recovery import _free_place
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.reduction import ReduceOptions, pipeline
 
 NORTH = 20.0
 SIZE = 41
@@ -36,12 +29,12 @@ class Frame:
 
     values: ClassVar[dict[str, Any]] = {}
 
-    def __init__(self, flux: float) -> None:
+    def __init__(self, flux):
         blank = np.zeros((SIZE, SIZE))
         self.flux = flux
         self.observation = dr.Observation.from_arrays(blank, blank + 1, pixelscale=PIXEL)
 
-    def render(self, *, background: bool, source: tuple[float, float]) -> Any:
+    def render(self, *, background, source):
         assert not background
         image = np.zeros((SIZE, SIZE))
         x, y = np.round(np.array(source) / PIXEL + SIZE // 2).astype(int)
@@ -49,14 +42,13 @@ class Frame:
         return image
 
 
-def searched(science: tuple[dr.Observation, ...] | None = None, **changes: Any) -> Any:
+def searched(science=None, **changes):
     """A search that measures what is on the pixel, with an error of a tenth of the limit."""
     y, x = np.indices((SIZE, SIZE))
     grid = (np.stack([x, y], axis=-1) - SIZE // 2) * PIXEL
     snr = np.where(np.hypot(*np.moveaxis(grid, -1, 0)) < 1.1, 0.0, np.nan)
 
-    def measure(places: Any) -> QTable:
-        assert science is not None
+    def measure(places):
         assert (science[1].data == 2 * science[0].data).all()
         values = [
             science[0].data[0][
@@ -77,7 +69,7 @@ def searched(science: tuple[dr.Observation, ...] | None = None, **changes: Any) 
     return SimpleNamespace(**{**values, **changes})
 
 
-def sources(candidates: QTable) -> Candidates:
+def sources(candidates):
     """Errors of contrasts are 1.5 times those for a known position."""
     places = np.stack([candidates["x"].value, candidates["y"].value], axis=-1)
     errors = torch.full((len(candidates),), 0.1 * LIMIT, dtype=torch.float64)
@@ -88,7 +80,7 @@ def sources(candidates: QTable) -> Candidates:
     )
 
 
-def table(places: Any, contrasts: Any) -> QTable:
+def table(places, contrasts):
     contrasts = np.asarray(contrasts, dtype=float)
     return QTable(
         {
@@ -100,10 +92,10 @@ def table(places: Any, contrasts: Any) -> QTable:
 
 
 @pytest.mark.parametrize("count", [1, 5])
-def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(count: int) -> None:
-    sets: list[tuple[dr.Observation, ...]] = []
+def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(count):
+    sets = []
 
-    def search(science: tuple[dr.Observation, ...]) -> Any:
+    def search(science):
         sets.append(science)
         return searched(science)
 
@@ -129,13 +121,13 @@ def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(count: in
     assert "..." not in str(planets)
 
 
-def test_no_planet_is_where_extended_light_would_hide_it() -> None:
+def test_no_planet_is_where_extended_light_would_hide_it():
     """All but a quarter of the field is hidden."""
     grid = searched().grid
     hidden = (grid[..., 0] < 0) | (grid[..., 1] < 0)
-    images: list[np.ndarray] = []
+    images = []
 
-    def search(science: tuple[dr.Observation, ...]) -> Any:
+    def search(science):
         images.append(science[0].data[0])
         return searched(science)
 
@@ -145,53 +137,10 @@ def test_no_planet_is_where_extended_light_would_hide_it() -> None:
     assert not any(each[hidden].any() for each in images)
 
 
-def test_planets_are_injected_into_the_frames_with_their_disk(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Whose light is fitted again, and hides other places than before."""
-    frame = dr.Observation.from_arrays(np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06)
-    before, after = (
-        cast(dr.Disk, SimpleNamespace(light=[each * np.ones(frame.shape)], fit=each,
-                                      hides_points=each)) for each in (2.0, 3.0)
-    )  # fmt: skip
-    calls: dict[str, Any] = {}
-
-    def searched_again(fit: Any, **options: Any) -> Any:
-        calls.update(options, fit=fit)
-
-    monkeypatch.setattr(pipeline, "fit_disk", lambda fit: after if fit == "fit" else before)
-    monkeypatch.setattr(pipeline, "detect", searched_again)
-    monkeypatch.setattr(pipeline, "recover_planets", lambda _, count, search: search((frame,)))
-    options = ReduceOptions(disk=True, injections=3, threshold=4.0)
-    run = pipeline._Run(cast(Any, SimpleNamespace(options=options)), False)
-    monkeypatch.setattr(
-        pipeline._Run, "_fit", lambda _, science, choice: calls.update(science=science) or "fit"
-    )
-    run._inject(cast(Any, None), cast(Any, None), before)
-    (fitted,) = calls["science"]
-    np.testing.assert_allclose(fitted.data[0], frame.data[0] + 2)
-    assert (calls["fit"], calls["without_limits"], calls["threshold"]) == (3.0, 3.0, 4.0)
-
-
-def test_sets_have_at_most_seven_planets_in_a_wide_field() -> None:
-    wide = QTable({"separation": [0.2, 1.1] * u.arcsec, "small_sample": [LIMIT, LIMIT]})
-    sizes: list[int] = []
-
-    def search(science: tuple[dr.Observation, ...]) -> Any:
-        sizes.append(np.count_nonzero(science[0].data))
-        return searched(science)
-
-    recover_planets(searched(contrast_curve=wide), 4, search)
-    assert sizes == [3, 1]
-    assert TOGETHER == 7
-
-
 @pytest.mark.parametrize(
     ("away", "expected"), [((0.05, 0.0), (7e-4, 1.5, True)), ((0.5, 0.5), (1e-4, 1.0, False))]
 )
-def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(
-    away: tuple[float, float], expected: tuple[float, float, bool]
-) -> None:
+def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(away, expected):
     place = (0.3, -0.6)
     data = np.zeros((SIZE, SIZE))
     data[SIZE // 2 - 10, SIZE // 2 + 5] = 1e-4
@@ -208,10 +157,10 @@ def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(
     assert measured.snr == pytest.approx(10 * contrast / LIMIT)
 
 
-def test_recovered_contrasts_are_relative_to_the_star_of_the_injection() -> None:
+def test_recovered_contrasts_are_relative_to_the_star_of_the_injection():
     """Though the star is twice as bright in the fit of the frames with planets."""
 
-    def search(science: tuple[dr.Observation, ...]) -> Any:
+    def search(science):
         brighter = SimpleNamespace(frames=[Frame(2.0), Frame(4.0)])
         return searched(science, fits=[brighter])
 
@@ -219,13 +168,13 @@ def test_recovered_contrasts_are_relative_to_the_star_of_the_injection() -> None
     np.testing.assert_allclose(planets["contrast"], 2 * planets["injected"])
 
 
-def covered(keep: Callable[[Any, Any], Any]) -> Any:
+def covered(keep):
     plain = searched()
     x, y = np.moveaxis(plain.grid, -1, 0)
     return searched(snr=np.where(keep(x, y), plain.snr, np.nan))
 
 
-def test_planets_keep_away_from_candidates_and_from_pixels_without_a_value() -> None:
+def test_planets_keep_away_from_candidates_and_from_pixels_without_a_value():
     first = _free_place(searched(), 0.6, 0.0)
     assert first == pytest.approx([0.0, 0.6])
     candidate = searched(candidates=table(first[None], [1e-3]))
@@ -238,7 +187,7 @@ def test_planets_keep_away_from_candidates_and_from_pixels_without_a_value() -> 
     assert _free_place(covered(lambda x, y: x > 9), 0.6, 0.0) == pytest.approx(first)
 
 
-def test_injected_planets_turn_with_the_sky() -> None:
+def test_injected_planets_turn_with_the_sky():
     """East of north is 30 degrees less from +y in a frame whose +y is 30 degrees further east."""
     frames = [Frame(3.0), Frame(3.0)]
     for frame, angle in zip(frames, (NORTH, NORTH + 30.0), strict=True):
@@ -252,6 +201,6 @@ def test_injected_planets_turn_with_the_sky() -> None:
 
 
 @pytest.mark.parametrize("count", [-1, 2.5])
-def test_a_wrong_number_of_planets_is_refused_before_anything_is_read(count: Any) -> None:
+def test_a_wrong_number_of_planets_is_refused_before_anything_is_read(count):
     with pytest.raises(IncompatibleSetupError, match="injections"):
         dr.reduce("no such folder", "no such map", injections=count)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
-from astropy import units as u
 from scipy import optimize
 
 from pyklip_diffrender.errors import (
@@ -17,7 +15,6 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     MissingOPDError,
     NonFiniteError,
-    NoValidPixelsError,
     RefinementError,
     ShapeError,
 )
@@ -25,13 +22,7 @@ from pyklip_diffrender.instrument.jwst import maskrnd_openings
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.parameters import LEVELS, OPTICAL_PARAMETERS
-from pyklip_diffrender.refinement import (
-    GaussNewton,
-    Refinement,
-    Status,
-    refine,
-)
+from pyklip_diffrender.refinement import GaussNewton, Status, refine
 from pyklip_diffrender.refinement.fit_result import breakdown_explained
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import (
@@ -51,8 +42,6 @@ ALIGNMENT = {"star_offset": (0.008, -0.006), "lyot_shift": (0.006, -0.004), "lyo
 BASIS = JointBasis([SegmentMotions(), FourierModes(6)])
 FEW = FourierModes(3)
 
-NOT_SUCCESS = (Status.MODEL_MISMATCH, Status.ITERATION_LIMIT, Status.DIVERGED)
-
 
 @dataclass
 class Case:
@@ -65,31 +54,25 @@ class Case:
     observation: Observation
 
     @property
-    def noise(self) -> np.ndarray:
+    def noise(self):
         return np.sqrt(self.star + BACKGROUND + READ_NOISE**2)
 
-    def error_of(self, star_and_background: np.ndarray) -> float:
+    def error_of(self, star_and_background):
         """Rms of a star model's error in units of the noise."""
         away = (star_and_background - BACKGROUND - self.star) / self.noise
         return float(np.sqrt(np.mean(away**2)))
 
 
-def observed(star: np.ndarray, pixelscale: tuple[float, float], seed: int) -> Observation:
+def observed(star, pixelscale, seed):
     rng = np.random.default_rng(seed)
     counts = rng.poisson(star + BACKGROUND) + rng.normal(0, READ_NOISE, star.shape)
     error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
     return Observation.from_arrays(counts, error, pixelscale=pixelscale, name="test star")
 
 
-def case(
-    basis: JointBasis | FourierModes,
-    nanometres: float,
-    alignment: dict[str, object],
-    flux: float = FLUX,
-    **changes: object,
-) -> Case:
+def case(basis, nanometres, alignment, flux=FLUX, **changes):
     settings = {"monochromatic": 4.5e-6, "npix": NPIX, "fov_pixels": 32, **changes}
-    model = nircam_coronagraph("F444W", **settings)  # type: ignore[arg-type]
+    model = nircam_coronagraph("F444W", **settings)
     opd = random_opd(3, npix=model.npix).data
     generator = torch.Generator().manual_seed(1)
     size = torch.where(basis.frequencies == 0, nanometres, nanometres / 4)
@@ -100,28 +83,23 @@ def case(
 
 
 @pytest.fixture(scope="module")
-def bright() -> Case:
+def bright():
     return case(BASIS, 2.0, ALIGNMENT)
 
 
 @pytest.fixture(scope="module")
-def fit(bright: Case) -> Refinement:
+def fit(bright):
     settings = GaussNewton(basis=BASIS, response_npix=NPIX)
     return refine(bright.model, bright.observation, bright.opd, settings=settings)
 
 
 @pytest.fixture(scope="module")
-def tiny() -> Case:
+def tiny():
     """Few modes, few pixels, a star that is hardly misaligned."""
     return case(FEW, 4.0, {"star_offset": (0.002, -0.001)}, flux=1e10, npix=64, fov_pixels=(24, 20))
 
 
-def quick(
-    case: Case,
-    observation: Observation | None = None,
-    start: Mapping[str, object] | None = None,
-    **changes: object,
-) -> Refinement:
+def quick(case, observation=None, start=None, **changes):
     return refine(
         case.model,
         case.observation if observation is None else observation,
@@ -131,21 +109,18 @@ def quick(
     )
 
 
-def few(**changes: object) -> GaussNewton:
+def few(**changes):
     """Settings of a fit that takes a second."""
-    return GaussNewton(**{"basis": FEW, "response_npix": 64, **changes})  # type: ignore[arg-type]
+    return GaussNewton(**{"basis": FEW, "response_npix": 64, **changes})
 
 
 @pytest.fixture(scope="module")
-def plain(tiny: Case) -> Refinement:
+def plain(tiny):
     """The small case as it is, for comparisons."""
     return quick(tiny)
 
 
-# -- what Gauss-Newton recovers --------------------------------------------------------------
-
-
-def test_gauss_newton_explains_the_data(fit: Refinement) -> None:
+def test_gauss_newton_explains_the_data(fit):
     assert fit.status is Status.CONVERGED
     assert fit.status.usable
     # 1024 pixels less about 100 parameters that they determine, and the scatter of chi2.
@@ -155,9 +130,7 @@ def test_gauss_newton_explains_the_data(fit: Refinement) -> None:
 
 
 @pytest.mark.hard
-def test_gauss_newton_lowers_the_error_of_the_star_to_about_the_noise(
-    bright: Case, fit: Refinement
-) -> None:
+def test_gauss_newton_lowers_the_error_of_the_star_to_about_the_noise(bright, fit):
     outdated = FLUX * bright.model(bright.opd).numpy() + BACKGROUND
     aligned = FLUX * bright.model(bright.opd, **ALIGNMENT).numpy() + BACKGROUND
     assert bright.error_of(outdated) > 100
@@ -169,7 +142,7 @@ def test_gauss_newton_lowers_the_error_of_the_star_to_about_the_noise(
     assert bright.error_of(1.01 * fit.frames[0].star) > 0.5
 
 
-def test_gauss_newton_recovers_alignment_flux_and_background(fit: Refinement) -> None:
+def test_gauss_newton_recovers_alignment_flux_and_background(fit):
     truth = {**ALIGNMENT, "flux": FLUX, "background": BACKGROUND}
     within = {
         "star_offset": 0.001, "lyot_shift": 0.002, "lyot_rotation": 0.1, "flux": 0.03 * FLUX,
@@ -183,14 +156,14 @@ def test_gauss_newton_recovers_alignment_flux_and_background(fit: Refinement) ->
         assert (fit.frames[0].errors[name] > 0).all()
 
 
-def test_the_refined_wavefront_is_nearer_to_the_truth(bright: Case, fit: Refinement) -> None:
+def test_the_refined_wavefront_is_nearer_to_the_truth(bright, fit):
     """Behind the Lyot stop; what the stop hides stays at the prior."""
     stop = polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy() > 0.5
     before, after = ((map_ - bright.later)[stop].std() for map_ in (bright.opd, fit.wavefront))
     assert after < 0.6 * before
 
 
-def test_the_history_tells_of_every_iteration(fit: Refinement) -> None:
+def test_the_history_tells_of_every_iteration(fit):
     assert [entry["iteration"] for entry in fit.history] == list(range(len(fit.history)))
     kappas = [entry["kappa"] for entry in fit.history]
     assert kappas == sorted(kappas, reverse=True)
@@ -201,20 +174,7 @@ def test_the_history_tells_of_every_iteration(fit: Refinement) -> None:
     assert fit.chi2_per_pixel < 1.01 * min(entry["chi2_per_pixel"] for entry in fit.history)
 
 
-def test_residual_is_data_minus_star(bright: Case, fit: Refinement) -> None:
-    np.testing.assert_array_equal(
-        fit.frames[0].residual, bright.observation.data - fit.frames[0].star
-    )
-    assert fit.frames[0].residual.shape == (1, 32, 32)
-    np.testing.assert_array_equal(
-        fit.frames[0].star,
-        fit.frames[0].values["flux"][0]
-        * bright.model(fit.frames[0].opd, **fit.frames[0].optical_values).numpy()
-        + fit.frames[0].values["background"][0],
-    )
-
-
-def test_the_parameter_table_has_values_errors_and_units(fit: Refinement) -> None:
+def test_the_parameter_table_has_values_errors_and_units(fit):
     table = fit.parameters
     rows = {row["name"]: row for row in table}
     assert list(rows) == [
@@ -226,42 +186,7 @@ def test_the_parameter_table_has_values_errors_and_units(fit: Refinement) -> Non
     assert float(rows["lyot_rotation"]["error"]) == fit.frames[0].errors["lyot_rotation"][0]
 
 
-def test_the_parameters_are_readable_on_80_columns(
-    fit: Refinement, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    table = fit.parameters
-    header, _, *lines = str(table).splitlines()
-    assert header.split() == list(table.colnames)
-    assert max(map(len, lines)) <= 80
-    for row, line in zip(table, lines, strict=True):
-        assert line.split()[1:4] == [row["name"], f"{row['value']:.5g}", f"{row['error']:.5g}"]
-        assert line.endswith(row["description"])
-    # The longest label of any parameter fits as well, beside the longest name and unit.
-    room = 80 - len("frame detector_shift[0] -1.2345e-06 1.2345e-06 MJy / sr ")
-    labels = [label for each in (*OPTICAL_PARAMETERS, *LEVELS) for label in each.labels()]
-    assert max(map(len, labels)) <= room
-    assert len(set(labels)) == len(labels)
-
-
-def test_the_summary_holds_what_provenance_needs(bright: Case, fit: Refinement) -> None:
-    summary = fit.summary()
-    assert summary["status"] == "CONVERGED"
-    assert summary["opd_sha256"] == fit.initial.sha256
-    assert summary["seconds"] > 0
-    assert "CONVERGED, 1 frame, chi2/pixel" in repr(fit)
-    assert "test star" in repr(fit.frames[0])
-
-
-def test_wavefront_and_absorption_are_real(fit: Refinement) -> None:
-    opd = fit.wavefront + 2e-9j
-    both = replace(fit, frames=(replace(fit.frames[0], opd=opd),))
-    assert both.wavefront.dtype == both.absorption.dtype == np.float64
-    np.testing.assert_array_equal(both.wavefront, opd.real)
-    np.testing.assert_array_equal(both.absorption, opd.imag)
-
-
-def test_a_pickled_fit_is_the_same_fit(plain: Refinement) -> None:
+def test_a_pickled_fit_is_the_same_fit(plain):
     written = pickle.dumps(plain)
     again = pickle.loads(written)
     np.testing.assert_array_equal(again.frames[0].star, plain.frames[0].star)
@@ -274,21 +199,7 @@ def test_a_pickled_fit_is_the_same_fit(plain: Refinement) -> None:
     assert len(pickle.dumps(plain)) < 1.01 * len(written) < 25e6
 
 
-def test_a_wavefront_in_nanometres_is_the_same_start(tiny: Case) -> None:
-    metres, nanometres = (
-        refine(tiny.model, tiny.observation, opd, settings=few(max_iterations=3))
-        for opd in (tiny.opd, tiny.opd * 1e9 * u.nm)
-    )
-    np.testing.assert_allclose(nanometres.frames[0].star, metres.frames[0].star, rtol=1e-9)
-
-
-def test_a_map_of_another_size_is_resampled(tiny: Case, plain: Refinement) -> None:
-    fine = np.repeat(np.repeat(tiny.opd, 2, axis=0), 2, axis=1)
-    got = refine(tiny.model, tiny.observation, fine, settings=few())
-    np.testing.assert_allclose(got.frames[0].star, plain.frames[0].star, rtol=1e-9)
-
-
-def test_alignment_alone_leaves_the_wavefront_as_it_was(tiny: Case, plain: Refinement) -> None:
+def test_alignment_alone_leaves_the_wavefront_as_it_was(tiny, plain):
     got = quick(tiny, wavefront=False)
     np.testing.assert_array_equal(got.wavefront, tiny.opd)
     assert got.status is Status.MODEL_MISMATCH
@@ -296,9 +207,7 @@ def test_alignment_alone_leaves_the_wavefront_as_it_was(tiny: Case, plain: Refin
 
 
 @pytest.mark.parametrize("explained", [True, False])
-def test_pixels_have_their_full_weight_where_the_data_are_explained(
-    tiny: Case, explained: bool
-) -> None:
+def test_pixels_have_their_full_weight_where_the_data_are_explained(tiny, explained):
     """Robust weights would take a faint source for an outlier, and some of its light with it."""
     fit = quick(tiny, robust=2.0, wavefront=explained)
     assert (fit.status is Status.CONVERGED) == explained
@@ -309,7 +218,7 @@ def test_pixels_have_their_full_weight_where_the_data_are_explained(
         assert np.quantile(share, 0.2) < 0.8
 
 
-def test_what_is_not_free_stays_where_it_was(tiny: Case) -> None:
+def test_what_is_not_free_stays_where_it_was(tiny):
     got = quick(tiny, free=("flux",), start={"star_offset": (0.002, -0.001), "background": 500.0})
     assert got.frames[0].values["star_offset"].tolist() == [0.002, -0.001]
     assert got.frames[0].values["background"].tolist() == [500.0]
@@ -318,7 +227,7 @@ def test_what_is_not_free_stays_where_it_was(tiny: Case) -> None:
     assert got.frames[0].values["flux"][0] == pytest.approx(1e10, rel=0.02)
 
 
-def test_frames_of_the_same_star_are_averaged(tiny: Case) -> None:
+def test_frames_of_the_same_star_are_averaged(tiny):
     frames = [observed(tiny.star, tiny.observation.pixelscale, seed) for seed in (11, 12, 13)]
     stack = replace(
         frames[0],
@@ -335,7 +244,7 @@ def test_frames_of_the_same_star_are_averaged(tiny: Case) -> None:
 
 
 @pytest.mark.slow
-def test_an_independent_minimiser_ends_where_gauss_newton_does() -> None:
+def test_an_independent_minimiser_ends_where_gauss_newton_does():
     """The penalised chi-squared written out once more, with reverse-mode gradients."""
     basis = FourierModes(2)
     small = case(basis, 12.0, {}, flux=3e10, npix=64, fov_pixels=24)
@@ -356,7 +265,7 @@ def test_an_independent_minimiser_ends_where_gauss_newton_does() -> None:
     # Unknowns in units in which the problem is well conditioned.
     unit = torch.cat([torch.tensor([1e-3, 1e-3, 1e-2 * 3e10, 10.0]), linear.deviation[4:]]).double()
 
-    def cost(scaled: np.ndarray) -> tuple[float, np.ndarray]:
+    def cost(scaled):
         x = (torch.from_numpy(scaled) * unit).requires_grad_()
         change = 1e-9 * torch.tensordot(x[4:], modes, dims=1)
         star = x[2] * small.model(torch.from_numpy(small.opd) + change, star_offset=x[:2]) + x[3]
@@ -379,10 +288,7 @@ def test_an_independent_minimiser_ends_where_gauss_newton_does() -> None:
     assert (apart.abs() < 0.05 * linear.covariance.diagonal().sqrt()).all()
 
 
-# -- what a fit must not see -----------------------------------------------------------------
-
-
-def with_junk(tiny: Case, junk: float) -> Refinement:
+def with_junk(tiny, junk):
     """A fit of the small case with 5 % of its pixels masked, and something else in them."""
     valid = np.random.default_rng(4).random(tiny.observation.shape) > 0.05
     data = np.where(valid, tiny.observation.data[0], junk)
@@ -392,13 +298,13 @@ def with_junk(tiny: Case, junk: float) -> Refinement:
 
 
 @pytest.fixture(scope="module")
-def clean(tiny: Case) -> Refinement:
+def clean(tiny):
     return with_junk(tiny, 0.0)
 
 
 @pytest.mark.hard
 @pytest.mark.parametrize("junk", [1e30, -1e30, np.nan, np.inf])
-def test_masked_pixels_change_nothing_bitwise(tiny: Case, clean: Refinement, junk: float) -> None:
+def test_masked_pixels_change_nothing_bitwise(tiny, clean, junk):
     dirty = with_junk(tiny, junk)
     assert dirty.wavefront.tobytes() == clean.wavefront.tobytes()
     assert dirty.frames[0].star.tobytes() == clean.frames[0].star.tobytes()
@@ -411,9 +317,7 @@ def test_masked_pixels_change_nothing_bitwise(tiny: Case, clean: Refinement, jun
 
 @pytest.mark.hard
 @pytest.mark.parametrize("share", [0.05, 0.5])
-def test_missing_pixels_cost_precision_not_truth(
-    tiny: Case, plain: Refinement, share: float
-) -> None:
+def test_missing_pixels_cost_precision_not_truth(tiny, plain, share):
     valid = np.random.default_rng(9).random(tiny.observation.shape) > share
     got = quick(tiny, replace(tiny.observation, valid=valid[None]))
     assert got.status is Status.CONVERGED
@@ -428,49 +332,21 @@ def test_missing_pixels_cost_precision_not_truth(
 
 
 @pytest.mark.hard
-def test_the_same_fit_gives_the_same_bits(tiny: Case, plain: Refinement) -> None:
+def test_the_same_fit_gives_the_same_bits(tiny, plain):
     first, again = quick(tiny), plain
     assert first.wavefront.tobytes() == again.wavefront.tobytes()
     assert first.frames[0].star.tobytes() == again.frames[0].star.tobytes()
     assert first.history == again.history
 
 
-def test_nothing_that_was_passed_in_is_modified(tiny: Case) -> None:
-    before = tiny.opd.copy(), tiny.observation.data.copy(), tiny.observation.error.copy()
-    refine(tiny.model, tiny.observation, tiny.opd, settings=few(max_iterations=2))
-    np.testing.assert_array_equal(tiny.opd, before[0])
-    np.testing.assert_array_equal(tiny.observation.data, before[1])
-    np.testing.assert_array_equal(tiny.observation.error, before[2])
-
-
-# -- how a fit ends --------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.hard
-def test_a_turned_wavefront_does_not_end_in_success(bright: Case) -> None:
-    """Upside down; `benchmarks.stability` has it transposed as well."""
-    got = refine(
-        bright.model,
-        bright.observation,
-        bright.opd[::-1].copy(),
-        settings=GaussNewton(basis=BASIS, response_npix=NPIX),
-    )
-    assert got.status in NOT_SUCCESS
-    assert got.chi2_per_pixel > 10
-    assert got.model_error > 0.03
-    # Errors are inflated by what is not explained.
-    assert got.frames[0].errors["flux"][0] > 1e-3 * FLUX
-
-
-def test_too_few_iterations_are_said(bright: Case) -> None:
+def test_too_few_iterations_are_said(bright):
     got = quick(bright, max_iterations=2)
     assert got.status is Status.ITERATION_LIMIT
     assert len(got.history) == 2
 
 
 @pytest.mark.slow
-def test_a_frame_without_a_star_is_no_success(tiny: Case) -> None:
+def test_a_frame_without_a_star_is_no_success(tiny):
     dark = observed(0 * tiny.star, tiny.observation.pixelscale, 3)
     negative = replace(dark, data=-tiny.observation.data)
     got = quick(tiny, negative)
@@ -478,10 +354,7 @@ def test_a_frame_without_a_star_is_no_success(tiny: Case) -> None:
     assert not got.status.usable
 
 
-# -- rendering elsewhere ---------------------------------------------------------------------
-
-
-def test_render_on_another_array_is_a_shifted_render(fit: Refinement) -> None:
+def test_render_on_another_array_is_a_shifted_render(fit):
     np.testing.assert_allclose(fit.frames[0].render(), fit.frames[0].star, rtol=1e-12)
     # The star, at (15.5, 15.5) of 32 x 32, comes to (8.5, 11.5): 7 columns and 4 rows back.
     moved = fit.frames[0].render((20, 24), center=(8.5, 11.5))
@@ -498,7 +371,7 @@ def test_render_on_another_array_is_a_shifted_render(fit: Refinement) -> None:
     )
 
 
-def test_a_star_off_the_middle_of_the_frame_is_followed(tiny: Case) -> None:
+def test_a_star_off_the_middle_of_the_frame_is_followed(tiny):
     """Two columns right and one row down: the same fit, and `render` brings it back."""
     scale = tiny.model.detector.pixelscale
     shift = {"star_offset": (0.002, -0.001), "detector_shift": (2 * scale[0], -scale[1])}
@@ -519,35 +392,25 @@ def test_a_star_off_the_middle_of_the_frame_is_followed(tiny: Case) -> None:
     np.testing.assert_allclose(back[1:, :-2], got.frames[0].star[:-1, 2:], rtol=1e-8)
 
 
-# -- bad input -------------------------------------------------------------------------------
-
-
-def test_a_missing_wavefront_is_an_error_not_a_default(tiny: Case) -> None:
+def test_a_missing_wavefront_is_an_error_not_a_default(tiny):
     with pytest.raises(MissingOPDError, match="path to an OPD map"):
         refine(tiny.model, tiny.observation, None)
 
 
-def test_an_observation_of_another_shape_says_what_to_do(tiny: Case) -> None:
+def test_an_observation_of_another_shape_says_what_to_do(tiny):
     frame = np.ones((20, 24))
     turned = Observation.from_arrays(frame, frame, pixelscale=0.0624)
     with pytest.raises(ShapeError, match=r"20 x 24.*24 x 20.*cutout"):
         refine(tiny.model, turned, tiny.opd)
 
 
-def test_an_unknown_free_parameter_lists_the_known(tiny: Case) -> None:
+def test_an_unknown_free_parameter_lists_the_known(tiny):
     with pytest.raises(IncompatibleSetupError, match=r"'lyot_shfit'.*lyot_shift"):
         quick(tiny, free=("lyot_shfit",))
 
 
 @pytest.mark.hard
-def test_all_pixels_masked_is_an_error(tiny: Case) -> None:
-    blind = replace(tiny.observation, valid=np.zeros_like(tiny.observation.valid))
-    with pytest.raises(NoValidPixelsError, match="test star"):
-        refine(tiny.model, blind, tiny.opd)
-
-
-@pytest.mark.hard
-def test_a_broken_wavefront_is_an_error(tiny: Case) -> None:
+def test_a_broken_wavefront_is_an_error(tiny):
     bad = tiny.opd.copy()
     bad[20, 20] = np.nan
     with pytest.raises(NonFiniteError, match=r"1 values inside the pupil.*\(20, 20\)"):
@@ -558,7 +421,7 @@ def test_a_broken_wavefront_is_an_error(tiny: Case) -> None:
         refine(tiny.model, tiny.observation, tiny.opd * 1e9, settings=few(max_iterations=1))
 
 
-def test_derivatives_from_far_away_do_not_end_a_fit() -> None:
+def test_derivatives_from_far_away_do_not_end_a_fit():
     """Steps that fail, and the last one, are repeated with accurate derivatives.
 
     A bright star, and a wavefront that is far from the map. Without the repetition chi-squared ends
@@ -585,20 +448,9 @@ def test_derivatives_from_far_away_do_not_end_a_fit() -> None:
     assert chi2[0] < 1.01 * chi2[1]
 
 
-def test_algebra_that_breaks_down_says_what_to_check() -> None:
+def test_algebra_that_breaks_down_says_what_to_check():
     with (
         pytest.raises(RefinementError, match=r"roll: the fit broke down.*Check the star's"),
         breakdown_explained("roll"),
     ):
         torch.linalg.cholesky(-torch.eye(2))
-
-
-def test_priors_are_widened_by_group() -> None:
-    """Where ratios are above 1; those of the drift are its own."""
-    prior = WavefrontPrior({"segment": 2.0, "texture": 0.5}, amplitude_scale=3.0)
-    drift = WavefrontPrior({"segment": 0.2, "texture": 0.1})
-    ratios = {"segment": 1.5, "texture": 0.7, "segment drift": 0.9, "texture drift": 4.0}
-    wider = GaussNewton(prior=prior, drift=drift).with_wider_priors({**ratios, "amplitude": 2.0})
-    assert wider.prior == replace(prior, scales={"segment": 3.0, "texture": 0.5}, amplitude_scale=6)
-    assert wider.drift == replace(drift, scales={"segment": 0.2, "texture": 0.4})
-    assert GaussNewton(prior=prior).with_wider_priors(ratios).drift is None

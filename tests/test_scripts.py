@@ -21,7 +21,7 @@ SCRIPTS = sorted(
 WITHOUT_OPTIONS = ("examples/paper/summary.py",)
 
 
-def run(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def run(script, monkeypatch):
     if script.startswith("benchmarks/"):
         name = script.removesuffix(".py").removesuffix("/__main__").replace("/", ".")
         # Another test may have imported it.
@@ -31,14 +31,8 @@ def run(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
         runpy.run_path(str(ROOT / script), run_name="__main__")
 
 
-def test_there_are_scripts() -> None:
-    assert len(SCRIPTS) > 20
-
-
 @pytest.mark.parametrize("script", [each for each in SCRIPTS if each not in WITHOUT_OPTIONS])
-def test_help(
-    script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help(script, monkeypatch, capsys):
     if "slurm" in script:
         pytest.importorskip("dask_jobqueue")
     if script.startswith("examples/"):

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+import small_files
 from astropy import units as u
 from astropy.io import fits
-from numpy.typing import NDArray
 
 from pyklip_diffrender.detection import detect, measure
-from pyklip_diffrender.errors import (
-    CorruptFileError,
-    IncompatibleSetupError,
-    NoValidPixelsError,
-)
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.headers import same_name
-from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern import learn_systematics
 from pyklip_diffrender.reduction import reduce
 from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
@@ -29,7 +23,7 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.scene.systematics import Systematics
-from pyklip_diffrender.wavefront.opd import OPDMap, random_opd
+from pyklip_diffrender.wavefront.opd import random_opd
 
 SIZE = 32
 SETTINGS = GaussNewton(cycles=6)
@@ -37,16 +31,16 @@ PLANET = Planet(2e-5, 0.6, 40.0)
 
 
 @cache
-def model() -> OpticalSystem:
+def model():
     return nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=SIZE)
 
 
 @cache
-def opd() -> OPDMap:
+def opd():
     return random_opd(1, npix=128)
 
 
-def pattern() -> NDArray[np.float64]:
+def pattern():
     """A multiplicative error of the model, 6 % rms, smooth over two pixels or so."""
     rough = np.random.default_rng(5).normal(size=(SIZE, SIZE))
     smooth = rough + np.roll(rough, 1, axis=0) + np.roll(rough, 1, axis=1)
@@ -54,7 +48,7 @@ def pattern() -> NDArray[np.float64]:
 
 
 @cache
-def frame(star: str, seed: int, *, planet: bool = False, roll: float = 0.0) -> Observation:
+def frame(star, seed, *, planet=False, roll=0.0):
     """A frame of a star whose light the pattern multiplies."""
     turned = replace(PLANET, position_angle=PLANET.position_angle - roll)
     scene = Scene(Star(exposure=20.0), (turned,) if planet else ())
@@ -68,41 +62,30 @@ def frame(star: str, seed: int, *, planet: bool = False, roll: float = 0.0) -> O
 
 
 @cache
-def reference_fit() -> Refinement:
+def reference_fit():
     return refine(model(), [frame("REF", 10), frame("REF", 11)], opd(), settings=SETTINGS)
 
 
-def calints(path: Path, star: str, roll: float, date: str, **cards: object) -> Path:
-    rng = np.random.default_rng(len(star))
-    primary = fits.PrimaryHDU()
+def calints(path, star, roll, date, **cards):
+    data = np.random.default_rng(len(star)).normal(10, 1, (2, 24, 24)).astype("f4")
     defaults = {
-        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "FILTER": "F444W", "PUPIL": "MASKRND",
-        "CORONMSK": "MASKA335R", "SUBARRAY": "SUB320A335R", "DETECTOR": "NRCALONG",
-        "TARGPROP": star, "DATE-BEG": date, "IS_PSF": False,
+        "TELESCOP": "JWST", "PUPIL": "MASKRND", "CORONMSK": "MASKA335R",
+        "SUBARRAY": "SUB320A335R", "DETECTOR": "NRCALONG", "IS_PSF": False,
     }  # fmt: skip
-    for key, value in {**defaults, **cards}.items():
-        primary.header[key] = value
-    science = fits.ImageHDU(rng.normal(10, 1, (2, 24, 24)).astype("f4"), name="SCI")
-    for key, value in {
-        "BUNIT": "MJy/sr", "PIXAR_A2": 0.0039, "CRPIX1": 13.0, "CRPIX2": 12.0,
-        "ROLL_REF": roll, "V3I_YANG": 0.05, "VPARITY": -1,
-    }.items():  # fmt: skip
-        science.header[key] = value
-    error = fits.ImageHDU(np.ones((2, 24, 24), "f4"), name="ERR")
-    quality = fits.ImageHDU(np.zeros((2, 24, 24), "i4"), name="DQ")
-    fits.HDUList([primary, science, error, quality]).writeto(path)
-    return path
+    primary = {**defaults, "TARGPROP": star, "DATE-BEG": date, **cards}
+    place = {"CRPIX1": 13.0, "CRPIX2": 12.0, "PIXAR_A2": 0.0039, "V3I_YANG": 0.05}
+    return small_files.calints(path, data, primary=primary, ROLL_REF=roll, **place)
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     calints(tmp_path / "a.fits", "AU MIC", 75.0, "2022-10-03T09:00:00")
     calints(tmp_path / "b.fits", "AU MIC", 65.0, "2022-10-03T06:00:00")
     calints(tmp_path / "c.fits", "HIP1", 20.0, "2022-10-03T07:00:00", IS_PSF=True)
     return tmp_path
 
 
-def test_files_are_sorted_by_their_headers(folder: Path) -> None:
+def test_files_are_sorted_by_their_headers(folder):
     sequence = Sequence.from_files(folder)
     assert sequence.target == "AU MIC"
     assert [each.name for each in sequence.science] == ["b.fits", "a.fits"]
@@ -117,7 +100,7 @@ def test_files_are_sorted_by_their_headers(folder: Path) -> None:
     assert sequence.cutout(10).science[0].shape == (10, 10)
 
 
-def test_rolls_are_cut_alike_if_their_stars_are_on_nearly_the_same_pixel() -> None:
+def test_rolls_are_cut_alike_if_their_stars_are_on_nearly_the_same_pixel():
     rolls = [
         Observation.from_arrays(
             np.arange(900.0).reshape(30, 30) + shift,
@@ -142,7 +125,7 @@ def test_rolls_are_cut_alike_if_their_stars_are_on_nearly_the_same_pixel() -> No
     assert cut.science[2].first_pixel == (618, 1610)
 
 
-def test_what_does_not_belong_is_left_out_with_a_reason(folder: Path) -> None:
+def test_what_does_not_belong_is_left_out_with_a_reason(folder):
     calints(
         folder / "d.fits", "HIP1", 20.0, "2022-10-03T08:00:00", CORONMSK="MASKA430R", IS_PSF=True
     )
@@ -169,11 +152,11 @@ def test_what_does_not_belong_is_left_out_with_a_reason(folder: Path) -> None:
         ("V1298 Tau", "1298 Tau", False),
     ],
 )
-def test_names_are_the_same_in_any_spelling(first: str, second: str, same: bool) -> None:
+def test_names_are_the_same_in_any_spelling(first, second, same):
     assert same_name(first, second) is same_name(second, first) is same
 
 
-def test_a_target_that_cannot_be_decided_is_an_error(folder: Path, tmp_path: Path) -> None:
+def test_a_target_that_cannot_be_decided_is_an_error(folder, tmp_path):
     with pytest.raises(IncompatibleSetupError, match=r"'VEGA', expected one of 'AU MIC', 'HIP1'$"):
         Sequence.from_files(folder, target="VEGA")
     with pytest.raises(IncompatibleSetupError, match=r"Did you mean 'AU MIC'\?"):
@@ -191,7 +174,7 @@ def test_a_target_that_cannot_be_decided_is_an_error(folder: Path, tmp_path: Pat
         Sequence.from_files(empty)
 
 
-def test_the_position_of_the_star_behind_the_mask_is_read(folder: Path) -> None:
+def test_the_position_of_the_star_behind_the_mask_is_read(folder):
     with fits.open(folder / "a.fits") as hdus:
         hdus.append(fits.ImageHDU(np.array([[0.2, -0.1], [0.4, -0.1]]), name="MASKOFFS"))
         hdus.writeto(folder / "h.fits")
@@ -200,7 +183,7 @@ def test_the_position_of_the_star_behind_the_mask_is_read(folder: Path) -> None:
     np.testing.assert_allclose(observation.star_offset, (0.3 * pixel, -0.1 * pixel), rtol=1e-6)
 
 
-def test_dithers_behind_the_mask_are_read(folder: Path) -> None:
+def test_dithers_behind_the_mask_are_read(folder):
     without = Observation.from_fits(folder / "a.fits")
     assert without.star_offset is None
     for key, value in (("XOFFSET", 0.02), ("YOFFSET", -0.01)):
@@ -223,7 +206,7 @@ def test_dithers_behind_the_mask_are_read(folder: Path) -> None:
     np.testing.assert_array_equal(away.center, without.center)
 
 
-def test_a_dithered_star_is_fitted_where_the_file_says() -> None:
+def test_a_dithered_star_is_fitted_where_the_file_says():
     offset = (0.02, -0.01)
     seen = simulate(model(), Scene(star_offset=offset), opd(), seed=4)
     scale = model().detector.pixelscale
@@ -237,7 +220,7 @@ def test_a_dithered_star_is_fitted_where_the_file_says() -> None:
 
 
 @pytest.mark.parametrize("name", [pytest.param("F356W", marks=pytest.mark.slow), "F444W"])
-def test_real_stars_are_off_the_mask_by_what_the_files_say(shared_data: Path, name: str) -> None:
+def test_real_stars_are_off_the_mask_by_what_the_files_say(shared_data, name):
     """The star moves by a third of a pixel, the mask stays on its pixels of the detector."""
     files = [Observation.from_fits(path) for path in sorted((shared_data / "gto1184").glob("*"))]
     frames = [each for each in files if each.filter == name]
@@ -248,7 +231,7 @@ def test_real_stars_are_off_the_mask_by_what_the_files_say(shared_data: Path, na
     assert np.ptp(stars - offsets, axis=0).max() < 0.001
 
 
-def test_a_pattern_is_learned_from_another_star() -> None:
+def test_a_pattern_is_learned_from_another_star():
     fit = reference_fit()
     assert fit.chi2_per_pixel > 5
     learned = learn_systematics(fit)
@@ -262,7 +245,7 @@ def test_a_pattern_is_learned_from_another_star() -> None:
 
 
 @pytest.mark.slow
-def test_with_the_pattern_the_planet_of_another_star_is_unbiased() -> None:
+def test_with_the_pattern_the_planet_of_another_star_is_unbiased():
     target = [frame("TARGET", 20, planet=True), frame("TARGET", 21, planet=True, roll=10.0)]
     without = refine(model(), target, opd(), settings=SETTINGS)
     learned = learn_systematics(reference_fit())
@@ -276,13 +259,13 @@ def test_with_the_pattern_the_planet_of_another_star_is_unbiased() -> None:
     assert row["snr"] > 10
 
 
-def test_a_pattern_needs_two_frames_of_one_filter() -> None:
+def test_a_pattern_needs_two_frames_of_one_filter():
     single = replace(reference_fit(), frames=reference_fit().frames[:1])
     with pytest.raises(IncompatibleSetupError, match="at least two"):
         learn_systematics(single)
 
 
-def test_systematics_survive_the_file(tmp_path: Path) -> None:
+def test_systematics_survive_the_file(tmp_path):
     learned = learn_systematics(reference_fit(), name="spring")
     back = Systematics.read(learned.write(tmp_path / "pattern.fits"))
     np.testing.assert_array_equal(back.pattern, learned.pattern)
@@ -297,13 +280,13 @@ def test_systematics_survive_the_file(tmp_path: Path) -> None:
 
 
 @cache
-def rolled_fit() -> Refinement:
+def rolled_fit():
     frames = [frame("TARGET", 20, planet=True), frame("TARGET", 21, planet=True, roll=10.0)]
     learned = learn_systematics(reference_fit())
     return refine(model(), frames, opd(), settings=SETTINGS, systematics=learned)
 
 
-def test_a_refinement_survives_the_file(tmp_path: Path) -> None:
+def test_a_refinement_survives_the_file(tmp_path):
     fit = rolled_fit()
     back = Refinement.read(fit.write(tmp_path / "fit.fits"))
     assert (back.status, back.settings) == (fit.status, fit.settings)
@@ -318,25 +301,7 @@ def test_a_refinement_survives_the_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again["contrast_error"], first["contrast_error"])
 
 
-@pytest.mark.slow
-def test_a_detection_in_a_file_is_that_in_the_fit(tmp_path: Path) -> None:
-    fit = rolled_fit()
-    again, first = detect(Refinement.read(fit.write(tmp_path / "fit.fits"))), detect(fit)
-    np.testing.assert_array_equal(again.snr, first.snr)
-    np.testing.assert_array_equal(again.candidates["contrast"], first.candidates["contrast"])
-    assert again.candidates["position_angle"][0].to_value(u.deg) == pytest.approx(40, abs=0.5)
-
-
-@pytest.mark.parametrize("percent", [25, 50, 99])
-def test_half_a_file_is_no_refinement(tmp_path: Path, percent: int) -> None:
-    path = reference_fit().write(tmp_path / "fit.fits")
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    with pytest.raises(CorruptFileError, match=r"fit\.fits"):
-        Refinement.read(path)
-
-
-def test_reduce_says_what_systematics_it_takes() -> None:
+def test_reduce_says_what_systematics_it_takes():
     sequence = Sequence("TARGET", (frame("TARGET", 20),))
     with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'references'"):
-        reduce(sequence, opd(), size=SIZE, systematics="maybe")  # type: ignore[arg-type]
+        reduce(sequence, opd(), size=SIZE, systematics="maybe")

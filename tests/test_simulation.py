@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy import units as u
 
 from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.scene import (
     ALPHA_PICTORIS_W2,
     UNOCCULTED_PEAK,
@@ -29,24 +27,21 @@ NPIX = 96
 
 
 @pytest.fixture(scope="module")
-def model() -> OpticalSystem:
+def model():
     return nircam_coronagraph("F444W", monochromatic=WAVELENGTH, npix=NPIX, fov_pixels=(32, 36))
 
 
 @pytest.fixture(scope="module")
-def opd() -> np.ndarray:
+def opd():
     return random_opd(5, npix=NPIX).data
 
 
-# -- photometry ------------------------------------------------------------------------------
-
-
-def test_the_papers_star_sends_the_papers_photons() -> None:
+def test_the_papers_star_sends_the_papers_photons():
     assert Star().peak_photons == pytest.approx(1.0334e10, rel=2e-4)
     assert Star().photons == pytest.approx(2.7807e12, rel=2e-4)
 
 
-def test_photons_follow_magnitude_exposure_and_gain() -> None:
+def test_photons_follow_magnitude_exposure_and_gain():
     star = Star()
     assert replace(star, w2_magnitude=star.w2_magnitude + 2.5).photons == pytest.approx(
         star.photons / 10, rel=1e-12
@@ -61,7 +56,7 @@ def test_photons_follow_magnitude_exposure_and_gain() -> None:
     )
 
 
-def test_the_unocculted_star_has_the_papers_peak() -> None:
+def test_the_unocculted_star_has_the_papers_peak():
     """Contrast 1 is the brightest pixel with the Lyot stop and without the occulter.
 
     How much falls there depends on where in the pixel the star is: the corner or the middle.
@@ -76,24 +71,17 @@ def test_the_unocculted_star_has_the_papers_peak() -> None:
     assert 0.93 * UNOCCULTED_PEAK < peak[80] < UNOCCULTED_PEAK < peak[81] < 1.08 * UNOCCULTED_PEAK
 
 
-# -- planets ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("angle", "direction"), [(0, (0, 1)), (90, (-1, 0)), (180, (0, -1)), (270, (1, 0))]
 )
-def test_position_angle_is_counter_clockwise_from_up(
-    angle: float, direction: tuple[int, int]
-) -> None:
+def test_position_angle_is_counter_clockwise_from_up(angle, direction):
     np.testing.assert_allclose(
         Planet(1e-6, 0.8, angle).offset, 0.8 * np.array(direction), atol=1e-15
     )
 
 
 @pytest.mark.parametrize("angle", [20.0, 110.0, 200.0, 290.0])
-def test_a_planet_appears_where_it_was_put(
-    model: OpticalSystem, opd: np.ndarray, angle: float
-) -> None:
+def test_a_planet_appears_where_it_was_put(model, opd, angle):
     scene = Scene(star_offset=(0.05, -0.03))
     planet = Planet(1e-3, 0.75, angle)
     image = planet_photons(model, scene, planet, opd)
@@ -112,7 +100,7 @@ def test_a_planet_appears_where_it_was_put(
 
 
 @pytest.mark.hard
-def test_planet_photons_are_linear_in_contrast(model: OpticalSystem, opd: np.ndarray) -> None:
+def test_planet_photons_are_linear_in_contrast(model, opd):
     scene = Scene()
     one = planet_photons(model, scene, Planet(1e-6, 0.6, 54), opd)
     assert one.max() > 0
@@ -124,18 +112,7 @@ def test_planet_photons_are_linear_in_contrast(model: OpticalSystem, opd: np.nda
         )
 
 
-def test_a_planet_of_contrast_one_on_the_star_is_the_star(
-    model: OpticalSystem, opd: np.ndarray
-) -> None:
-    scene = Scene(star_offset=(0.02, 0.01))
-    np.testing.assert_allclose(
-        planet_photons(model, scene, Planet(1.0, 0.0), opd),
-        star_photons(model, scene, opd),
-        rtol=1e-12,
-    )
-
-
-def test_a_scene_is_the_sum_of_its_parts(model: OpticalSystem, opd: np.ndarray) -> None:
+def test_a_scene_is_the_sum_of_its_parts(model, opd):
     planets = (Planet(1e-5, 0.6, 54), Planet(2e-6, 0.7, 58))
     scene = Scene(planets=planets, background=321.0, star_offset=(0.01, 0.0))
     parts = star_photons(model, scene, opd) + 321.0
@@ -149,16 +126,7 @@ def test_a_scene_is_the_sum_of_its_parts(model: OpticalSystem, opd: np.ndarray) 
     )
 
 
-def test_units_of_the_wavefront_are_honoured(model: OpticalSystem, opd: np.ndarray) -> None:
-    np.testing.assert_allclose(
-        star_photons(model, Scene(), opd * 1e9 * u.nm), star_photons(model, Scene(), opd), rtol=1e-9
-    )
-
-
-# -- noise -----------------------------------------------------------------------------------
-
-
-def test_noise_has_the_mean_and_variance_of_photons_and_readout() -> None:
+def test_noise_has_the_mean_and_variance_of_photons_and_readout():
     model = nircam_coronagraph("F444W", monochromatic=WAVELENGTH, npix=48, fov_pixels=12)
     # From 1e2 to 1e5 photons: readout matters in some pixels, photons in others.
     scene = Scene(star=Star(exposure=20.0), background=100.0)
@@ -182,16 +150,8 @@ def test_noise_has_the_mean_and_variance_of_photons_and_readout() -> None:
     assert abs(np.mean(residual[:, 1:] * residual[:, :-1])) < 5 / np.sqrt(residual.size)
 
 
-def test_many_seeds_average_to_the_scene(model: OpticalSystem, opd: np.ndarray) -> None:
-    scene = Scene(star=Star(exposure=20.0))
-    expected = expected_photons(model, scene, opd)
-    seeds = [simulate(model, scene, opd, seed=s).data[0] for s in range(100)]
-    away = (np.mean(seeds, axis=0) - expected) / np.sqrt((expected + 42.0**2) / 100)
-    assert np.sqrt(np.mean(away**2)) == pytest.approx(1.0, abs=0.15)
-
-
 @pytest.mark.hard
-def test_the_same_seed_gives_the_same_frames(model: OpticalSystem, opd: np.ndarray) -> None:
+def test_the_same_seed_gives_the_same_frames(model, opd):
     scene = Scene(planets=(Planet(1e-5, 0.6, 54),))
     first = simulate(model, scene, opd, seed=8, frames=2)
     again = simulate(model, scene, opd, seed=8, frames=2)
@@ -201,7 +161,7 @@ def test_the_same_seed_gives_the_same_frames(model: OpticalSystem, opd: np.ndarr
     assert not np.array_equal(first.data[0], first.data[1])
 
 
-def test_a_simulation_says_what_it_is(model: OpticalSystem, opd: np.ndarray) -> None:
+def test_a_simulation_says_what_it_is(model, opd):
     got = simulate(model, Scene(), opd, seed=4, frames=3)
     assert got.data.shape == (3, 32, 36)
     assert got.unit == u.photon
@@ -213,13 +173,8 @@ def test_a_simulation_says_what_it_is(model: OpticalSystem, opd: np.ndarray) -> 
     np.testing.assert_allclose(got.error, np.sqrt(np.maximum(got.data, 0) + 42.0**2), rtol=1e-14)
 
 
-# -- the paper's scene -----------------------------------------------------------------------
-
-
 @pytest.mark.slow
-def test_the_papers_scene_behind_the_official_stop_is_fainter_than_published(
-    shared_data: Path,
-) -> None:
+def test_the_papers_scene_behind_the_official_stop_is_fainter_than_published(shared_data):
     model = nircam_coronagraph("F444W", monochromatic=WAVELENGTH, segment_gap=0.0)
     pair = [read_opd(shared_data / f"opd_2022-08-{day}.fits.gz") for day in (11, 14)]
     before, after = (opd.data for opd in pair)
@@ -236,7 +191,7 @@ def test_the_papers_scene_behind_the_official_stop_is_fainter_than_published(
 @pytest.mark.parametrize(
     ("x", "y", "angle"), [(0.0, 0.5, 0.0), (-0.5, 0.0, 90.0), (0.0, -0.5, 180.0), (0.5, 0.0, 270.0)]
 )
-def test_position_angles_are_counter_clockwise_from_up(x: float, y: float, angle: float) -> None:
+def test_position_angles_are_counter_clockwise_from_up(x, y, angle):
     planet = Planet.from_offset(1e-4, x, y)
     assert planet.position_angle % 360 == pytest.approx(angle)
     assert planet.offset == pytest.approx((x, y), abs=1e-12)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -46,7 +45,7 @@ COVARIANCE = np.array([[4.0, 1.5], [1.5, 1.0]]) * 1e-6
 SKY = Sky(north=NORTH, mjd=59855.5, star=(0.4, 0.04))
 
 
-def observation(folder: Path, **changes: object) -> Observation:
+def observation(folder, **changes):
     # Not the same value everywhere, which would be an integration without data.
     image = np.random.default_rng(3).normal(1.0, 0.01, (1, 16, 20))
     science = fits.ImageHDU(image.astype("f4"), name="SCI")
@@ -59,7 +58,7 @@ def observation(folder: Path, **changes: object) -> Observation:
     return Observation.from_fits(folder / "calints.fits")
 
 
-def candidates(offsets: list[list[float]], contrasts: list[float]) -> Candidates:
+def candidates(offsets, contrasts):
     count = len(contrasts)
     covariance = np.zeros((3, count, 3, count))
     for k, contrast in enumerate(contrasts):
@@ -70,20 +69,15 @@ def candidates(offsets: list[list[float]], contrasts: list[float]) -> Candidates
     return Candidates(start.offsets, start.contrasts, flat, 0.08 * start.contrasts)
 
 
-def table(sky: Sky = SKY) -> QTable:
+def table(sky=SKY):
     known = candidates([[-0.3, 0.5], [0.2, -0.8]], [1e-4, 2e-4])
     return candidate_table(
         known, ErrorFactor.constant(1.0), np.array([[0.1, 0.1], [0.02, 0.02]]), sky
     )
 
 
-# -- orientation -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("pixels", [(10, 0), (0, 10), (-9, 13), (7, -12), (-20, -4)])
-def test_the_sky_is_where_the_frames_own_wcs_has_it(
-    tmp_path: Path, pixels: tuple[int, int]
-) -> None:
+def test_the_sky_is_where_the_frames_own_wcs_has_it(tmp_path, pixels):
     """A flipped axis or a wrong sign is wrong by the whole offset; the scales agree to 0.2 %."""
     got = observation(tmp_path)
     mask = detector_place("MASK335R", "F444W")
@@ -109,7 +103,7 @@ def test_the_sky_is_where_the_frames_own_wcs_has_it(
     assert (away + 180) % 360 - 180 == pytest.approx(0, abs=0.2)
 
 
-def test_a_planet_in_an_image_is_on_the_side_of_the_sky_where_the_wcs_has_it() -> None:
+def test_a_planet_in_an_image_is_on_the_side_of_the_sky_where_the_wcs_has_it():
     """From the model's own pixels: `Planet.offset` and the table have the same x and y."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=33)
     planet = dr.Planet(1.0, 0.8, 35.0)
@@ -137,7 +131,7 @@ def test_a_planet_in_an_image_is_on_the_side_of_the_sky_where_the_wcs_has_it() -
     assert known["delta_dec"][0].to_value("arcsec") == pytest.approx(north.arcsec, abs=0.05)
 
 
-def test_without_a_roll_angle_nothing_is_said_about_the_sky(tmp_path: Path) -> None:
+def test_without_a_roll_angle_nothing_is_said_about_the_sky(tmp_path):
     assert observation(tmp_path, ROLL_REF=None).position_angles is None
     blind = table(Sky(mjd=59855.5))
     assert not {"delta_ra", "delta_dec", "radec_corr"} & set(blind.colnames)
@@ -145,10 +139,7 @@ def test_without_a_roll_angle_nothing_is_said_about_the_sky(tmp_path: Path) -> N
     np.testing.assert_array_equal(blind["position_angle"], blind["frame_angle"])
 
 
-# -- errors ------------------------------------------------------------------------------------
-
-
-def test_the_covariance_turns_with_the_frame(rng: np.random.Generator) -> None:
+def test_the_covariance_turns_with_the_frame(rng):
     """Against draws, turned as complex numbers: north + i east is y - i x times exp(i north)."""
     row = table()[1]
     place = np.array([row["x"].value, row["y"].value])
@@ -168,7 +159,7 @@ def test_the_covariance_turns_with_the_frame(rng: np.random.Generator) -> None:
         assert row[corr] == pytest.approx(np.corrcoef(*pair)[0, 1], abs=0.02)
 
 
-def test_the_flux_of_a_planet_does_not_have_the_error_of_the_stars_flux() -> None:
+def test_the_flux_of_a_planet_does_not_have_the_error_of_the_stars_flux():
     row = table()[0]
     # 10 % of noise; 10 % of the star's flux and its image, of which 2 % of the image alone.
     assert row["contrast_error"] / row["contrast"] == pytest.approx(np.hypot(0.1, 0.1))
@@ -179,11 +170,8 @@ def test_the_flux_of_a_planet_does_not_have_the_error_of_the_stars_flux() -> Non
     assert row["ab_mag_error"].value == pytest.approx(2.5 / np.log(10) * share)
 
 
-# -- limits ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("sigmas", [3.0, 5.0])
-def test_what_is_not_detected_has_an_upper_limit(sigmas: float) -> None:
+def test_what_is_not_detected_has_an_upper_limit(sigmas):
     snr = np.array([-1.0, 2.0, 4.0, 9.0])
     raw = QTable({"x": [0.5] * 4 * u.arcsec, "y": [0.1] * 4 * u.arcsec, "contrast": 1e-6 * snr,
                   "contrast_error": np.full(4, 1e-6), "snr": snr})  # fmt: skip
@@ -201,7 +189,7 @@ def test_what_is_not_detected_has_an_upper_limit(sigmas: float) -> None:
 
 
 @pytest.mark.parametrize("made", ["candidates", "measured", "curve"])
-def test_a_table_shows_its_contrasts_on_80_columns(made: str) -> None:
+def test_a_table_shows_its_contrasts_on_80_columns(made):
     ring = [np.full(4, 1.23456789e-6)] * 2
     raw = QTable({"x": [0.5] * u.arcsec, "y": [0.1] * u.arcsec, "contrast": [1.23e-6],
                   "contrast_error": [1e-6], "snr": [1.23]})  # fmt: skip
@@ -219,10 +207,7 @@ def test_a_table_shows_its_contrasts_on_80_columns(made: str) -> None:
     assert all(shown[name].info.description for name in shown.colnames)
 
 
-# -- flux and epoch ----------------------------------------------------------------------------
-
-
-def fitted(observation: Observation) -> FrameFit:
+def fitted(observation):
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=16)
     return cast(
         "FrameFit",
@@ -233,8 +218,8 @@ def fitted(observation: Observation) -> FrameFit:
     )  # fmt: skip
 
 
-def test_the_stop_passes_what_arrives_of_a_star_without_the_occulter() -> None:
-    options: Any = {"monochromatic": 4.5e-6, "npix": 256, "si_wfe": False}
+def test_the_stop_passes_what_arrives_of_a_star_without_the_occulter():
+    options = {"monochromatic": 4.5e-6, "npix": 256, "si_wfe": False}
     model = dr.nircam_coronagraph("F444W", fov_pixels=16, **options)
     bare = dr.nircam_coronagraph("F444W", fov_pixels=160, image_mask=None, **options)
     share = model.transmission()
@@ -247,7 +232,7 @@ def test_the_stop_passes_what_arrives_of_a_star_without_the_occulter() -> None:
     assert moved < 0.9 * share
 
 
-def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path: Path) -> None:
+def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path):
     got = observation(tmp_path)
     frame = fitted(got)
     scale = jansky_per_unit(frame)
@@ -268,29 +253,23 @@ def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path: Path) ->
         require_calibrated(got)
 
 
-def test_simulated_frames_have_no_flux_density() -> None:
-    frames = Observation.from_arrays(np.ones((4, 4)), np.ones((4, 4)), pixelscale=0.06)
-    assert jansky_per_unit(fitted(frames)) is None
-
-
 @pytest.mark.parametrize(
     "star", [0.36308, "0.36308 Jy", 363.08 * u.mJy, 10.0 * u.ABmag, "363.08 mJy"]
 )
-def test_the_stars_flux_may_be_given_in_any_unit(star: Any) -> None:
+def test_the_stars_flux_may_be_given_in_any_unit(star):
     assert to_jansky(star) == pytest.approx(0.36308, rel=1e-4)
 
 
 @pytest.mark.parametrize("star", [0, -1.0, math.nan, math.inf, "bright", 3 * u.m, None, [0.1, 0.2]])
-def test_what_is_no_flux_is_refused(star: Any) -> None:
+def test_what_is_no_flux_is_refused(star):
     with pytest.raises(IncompatibleSetupError, match=r"star_flux: got .* expected a"):
         to_jansky(star)
 
 
-def test_the_epoch_is_the_middle_of_the_exposures(tmp_path: Path) -> None:
+def test_the_epoch_is_the_middle_of_the_exposures(tmp_path):
     (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
     first = observation(tmp_path / "a")
     later = observation(tmp_path / "b", EXPMID=None, **{"DATE-BEG": "2022-10-03T16:00:00"})
-    assert first.mid_date is not None
     assert first.mid_date.mjd == REAL["EXPMID"]
     frames = [fitted(first), fitted(later)]
     opd = dr.random_opd(1, npix=128)
@@ -302,10 +281,7 @@ def test_the_epoch_is_the_middle_of_the_exposures(tmp_path: Path) -> None:
     assert set(table(sky)["epoch_mjd"]) == {sky.mjd}
 
 
-# -- orbits ------------------------------------------------------------------------------------
-
-
-def test_orbitize_reads_the_astrometry(tmp_path: Path) -> None:
+def test_orbitize_reads_the_astrometry(tmp_path):
     """As its `read_file` does: astropy's reader, MJD, integers, mas and degrees."""
     known = table()
     path = write_astrometry(known, tmp_path / "astrometry.csv", "orbitize")
@@ -321,7 +297,7 @@ def test_orbitize_reads_the_astrometry(tmp_path: Path) -> None:
     np.testing.assert_allclose(read["radec_corr"], known["radec_corr"], rtol=1e-5)
 
 
-def test_backtracks_and_octofitter_read_the_astrometry(tmp_path: Path) -> None:
+def test_backtracks_and_octofitter_read_the_astrometry(tmp_path):
     """backtracks takes columns by their place, as in its `System`; Octofitter by their names."""
     known = table()
     ra, error = (known[name].to_value("mas") for name in ("delta_ra", "delta_ra_error"))
@@ -337,7 +313,7 @@ def test_backtracks_and_octofitter_read_the_astrometry(tmp_path: Path) -> None:
         np.testing.assert_allclose(rows[name], expected, rtol=1e-5)
 
 
-def test_orvara_reads_the_astrometry(tmp_path: Path) -> None:
+def test_orvara_reads_the_astrometry(tmp_path):
     known = table()
     path = write_astrometry(known, tmp_path / "relAst.txt", "orvara")
     read = np.genfromtxt(path, usecols=range(7))
@@ -356,17 +332,14 @@ def test_orvara_reads_the_astrometry(tmp_path: Path) -> None:
         (SKY, "csv", "expected one of orbitize, backtracks"),
     ],
 )
-def test_an_orbit_needs_angle_and_date(sky: Sky, format: str, message: str, tmp_path: Path) -> None:
+def test_an_orbit_needs_angle_and_date(sky, format, message, tmp_path):
     with pytest.raises(IncompatibleSetupError, match=message):
         write_astrometry(table(sky), tmp_path / "astrometry.csv", format)
     assert not list(tmp_path.iterdir())
 
 
-# -- real frames -------------------------------------------------------------------------------
-
-
 @pytest.mark.study  # Three minutes.
-def test_the_companion_of_hip_65426_is_on_its_side_of_the_star(shared_data: Path) -> None:
+def test_the_companion_of_hip_65426_is_on_its_side_of_the_star(shared_data):
     """The header's roll is a placeholder, but the telescope keeps its shade towards the sun.
 
     Its V3 axis points away from the sun, within some degrees. The companion's published position

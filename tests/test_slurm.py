@@ -26,7 +26,7 @@ exit 0
 
 
 @pytest.mark.slow
-def test_a_survey_runs_in_jobs_of_slurm(tmp_path: Path, shared_data: Path) -> None:
+def test_a_survey_runs_in_jobs_of_slurm(tmp_path, shared_data):
     pytest.importorskip("dask_jobqueue")
     for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL)):
         program = tmp_path / name

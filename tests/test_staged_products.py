@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +12,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.errors import (
-    CorruptFileError,
-    ExistingFileError,
-    IncompatibleSetupError,
-)
+from pyklip_diffrender.errors import CorruptFileError, ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.reduction import (
     UNFINISHED,
     Preparation,
@@ -34,7 +28,7 @@ ROLL = 25.0
 PLANET = dr.Planet(2e-4, 0.5, 40.0)
 
 
-def preparation(**options: Any) -> Preparation:
+def preparation(**options):
     """One small frame of a star with a planet, and what is needed to reduce it."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
     opd = dr.random_opd(1, npix=128)
@@ -59,12 +53,12 @@ INJECTED = QTable(
 )  # fmt: skip
 
 
-def interrupted(*_: Any, **__: Any) -> Any:
+def interrupted(*_, **__):
     raise KeyboardInterrupt
 
 
 @pytest.fixture(scope="module")
-def stopped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Preparation, Path]:
+def stopped(tmp_path_factory):
     """A reduction that was interrupted while planets were injected."""
     prepared, folder = preparation(), tmp_path_factory.mktemp("products")
     with pytest.MonkeyPatch.context() as patch:
@@ -74,9 +68,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Preparation, Path
     return prepared, folder
 
 
-def test_an_interrupted_reduction_leaves_fit_and_search(
-    stopped: tuple[Preparation, Path],
-) -> None:
+def test_an_interrupted_reduction_leaves_fit_and_search(stopped):
     _, folder = stopped
     names = {path.name for path in folder.iterdir()}
     assert {"report.html", "summary.json", "fit.fits", "detection.fits", UNFINISHED} <= names
@@ -86,9 +78,7 @@ def test_an_interrupted_reduction_leaves_fit_and_search(
         ProductFolder(folder)
 
 
-def test_a_resumed_reduction_does_not_fit_again(
-    stopped: tuple[Preparation, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_reduction_does_not_fit_again(stopped, tmp_path, monkeypatch):
     prepared, before = stopped
     for path in before.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -109,9 +99,7 @@ def test_a_resumed_reduction_does_not_fit_again(
     assert dr.Refinement.read(tmp_path / "fit.fits").stored_linear is None
 
 
-def test_another_reduction_is_not_resumed(
-    stopped: tuple[Preparation, Path], tmp_path: Path
-) -> None:
+def test_another_reduction_is_not_resumed(stopped, tmp_path):
     prepared, folder = stopped
     for changed in (
         replace(prepared, options=replace(prepared.options, threshold=4.0)),
@@ -126,7 +114,7 @@ def test_another_reduction_is_not_resumed(
         dr.reduce(prepared.sequence, prepared.wavefront, resume=True)
 
 
-def test_a_detection_in_terms_of_astropy(stopped: tuple[Preparation, Path]) -> None:
+def test_a_detection_in_terms_of_astropy(stopped):
     prepared, folder = stopped
     detection = dr.Detection.read(folder)
     (place,) = detection.coordinates
@@ -152,18 +140,18 @@ def test_a_detection_in_terms_of_astropy(stopped: tuple[Preparation, Path]) -> N
         _without_pointing(detection).coordinates  # noqa: B018
 
 
-def _without_pointing(detection: dr.Detection) -> dr.Detection:
+def _without_pointing(detection):
     copied = replace(detection)
     vars(copied).update({k: v for k, v in vars(detection).items() if k not in vars(copied)})
     vars(copied)["observation"] = replace(detection.observation, header=fits.Header())
     return copied
 
 
-def test_a_quick_reduction_is_coarser_where_the_star_is_fainter() -> None:
+def test_a_quick_reduction_is_coarser_where_the_star_is_fainter():
     ones = np.ones((1, 80, 80))
     header = fits.Header({"INSTRUME": "NIRCAM", "CORONMSK": "MASKA335R"})
 
-    def frame(snr: float) -> dr.Observation:
+    def frame(snr):
         return dr.Observation.from_arrays(
             snr * ones, ones, pixelscale=0.063, filter="F444W", header=header
         )
@@ -178,4 +166,4 @@ def test_a_quick_reduction_is_coarser_where_the_star_is_fainter() -> None:
     assert coarse_arguments(bright, 320)["npix"] == 256
     for wrong in ({"accuracy": "fast"}, {"accuracy": "quick", "settings": dr.GaussNewton()}):
         with pytest.raises(IncompatibleSetupError, match="accuracy"):
-            ReduceOptions(**wrong)  # type: ignore[arg-type]
+            ReduceOptions(**wrong)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from astropy import units as u
@@ -14,12 +13,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import measured_planet
 from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.reduction import ReduceOptions, prepare
-from pyklip_diffrender.refinement import (
-    Refinement,
-    jansky_per_unit,
-    star_flux_error,
-    with_star_flux,
-)
+from pyklip_diffrender.refinement import jansky_per_unit, star_flux_error, with_star_flux
 from pyklip_diffrender.wavefront import as_opd_map
 
 TRUTH = 3e-5
@@ -28,7 +22,7 @@ SETTINGS = dr.GaussNewton(cycles=6)
 
 
 @pytest.fixture(scope="module")
-def fit() -> Refinement:
+def fit():
     """A simulated star and planet, with the header of a calibrated frame."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
     opd = dr.random_opd(1, npix=128)
@@ -38,7 +32,7 @@ def fit() -> Refinement:
     return dr.refine(model, frame, opd, settings=SETTINGS)
 
 
-def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit: Refinement) -> None:
+def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit):
     detection = dr.detect(fit)
     (planet,) = detection.candidates
     assert star_flux_error(fit) == 0.1
@@ -58,15 +52,13 @@ def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit: Refineme
     assert brighter.snr == injected.snr
 
 
-def test_simulated_frames_have_no_such_error(fit: Refinement) -> None:
+def test_simulated_frames_have_no_such_error(fit):
     (frame,) = fit.frames
     plain = replace(frame, observation=replace(frame.observation, header=fits.Header()))
     assert star_flux_error(replace(fit, frames=(plain,))) == 0.0
 
 
-def test_without_a_map_the_star_is_less_certain(
-    fit: Refinement, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_map_the_star_is_less_certain(fit, caplog):
     flat = as_opd_map("flat")
     assert star_flux_error(replace(fit, initial=flat)) == 0.4
     assert star_flux_error(replace(fit, initial=flat, catalogue_error=0.05)) == 0.05
@@ -87,14 +79,12 @@ def test_without_a_map_the_star_is_less_certain(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.98, 1.02])
-def test_contrasts_refer_to_the_catalogues_star(fit: Refinement, share: float) -> None:
+def test_contrasts_refer_to_the_catalogues_star(fit, share):
     """Held more tightly than these frames, which determine it to 1e-4: the star obeys."""
     before = dr.detect(fit)
-    assert before.sky.star is not None
     tied = with_star_flux(fit, share * before.sky.star[0], 0.05, held=1e-6)
     after = dr.detect(tied)
     assert star_flux_error(tied) == 0.05
-    assert after.sky.star is not None
     assert after.sky.star[0] / before.sky.star[0] == pytest.approx(share, rel=3e-4)
     (then,), (now,) = before.candidates, after.candidates
     assert now["contrast"] / then["contrast"] == pytest.approx(1 / share, rel=6e-3)
@@ -105,24 +95,9 @@ def test_contrasts_refer_to_the_catalogues_star(fit: Refinement, share: float) -
 
 
 @pytest.mark.slow
-def test_a_prior_that_agrees_changes_nothing_but_the_error(fit: Refinement) -> None:
-    before = dr.detect(fit)
-    assert before.sky.star is not None
-    after = dr.detect(with_star_flux(fit, before.sky.star[0], 0.03))
-    (then,), (now,) = before.candidates, after.candidates
-    assert now["contrast"] == pytest.approx(then["contrast"], rel=2e-3)
-    assert now["contrast"] == pytest.approx(TRUTH, rel=4 / now["snr"])
-    assert now["contrast_error"] / now["contrast"] == pytest.approx(0.03, rel=0.02)
-    assert then["contrast_error"] / then["contrast"] == pytest.approx(0.1, rel=0.02)
-
-
-@pytest.mark.slow
-def test_the_stars_flux_is_the_stated_one_wherever_it_is_shown(
-    fit: Refinement, tmp_path: Path
-) -> None:
+def test_the_stars_flux_is_the_stated_one_wherever_it_is_shown(fit, tmp_path):
     """Frames that pull at the star, because they determine its flux better than it is held."""
     before = dr.detect(fit)
-    assert before.sky.star is not None
     stated = 1.04 * before.sky.star[0]
     tied = with_star_flux(fit, stated, 0.05)
     (frame,) = tied.frames
@@ -130,7 +105,6 @@ def test_the_stars_flux_is_the_stated_one_wherever_it_is_shown(
     assert scale is not None
     assert scale * frame.flux == pytest.approx(stated, rel=0.005)
     detection = dr.detect(tied)
-    assert detection.sky.star is not None
     assert detection.sky.star[0] == stated
     detection.write(tmp_path)
     assert fits.getheader(tmp_path / "detection.fits")["DRSTARJY"] == stated
@@ -138,7 +112,7 @@ def test_the_stars_flux_is_the_stated_one_wherever_it_is_shown(
     assert (again.catalogue_flux, again.catalogue_error) == (stated, 0.05)
 
 
-def test_frames_without_calibration_are_refused_before_the_fit(fit: Refinement) -> None:
+def test_frames_without_calibration_are_refused_before_the_fit(fit):
     (frame,) = fit.frames
     bare = replace(frame.observation, header=fits.Header({"INSTRUME": "NIRCAM"}))
     with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
@@ -149,7 +123,7 @@ def test_frames_without_calibration_are_refused_before_the_fit(fit: Refinement) 
 
 
 @pytest.mark.parametrize("error", [0.0, -0.1, math.nan])
-def test_errors_that_are_not_positive_are_refused(fit: Refinement, error: float) -> None:
+def test_errors_that_are_not_positive_are_refused(fit, error):
     sequence = dr.Sequence("a star", (fit.frames[0].observation,))
     with pytest.raises((IncompatibleSetupError, UnitError, ValueError), match="star_flux_error"):
         dr.reduce(sequence, fit.initial, star_flux=0.4, star_flux_error=error)

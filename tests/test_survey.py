@@ -3,95 +3,55 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
 import sys
-from collections.abc import Callable
-from concurrent.futures import CancelledError
 from dataclasses import replace
 from datetime import date
 from functools import partial
 from html.parser import HTMLParser
 from math import inf
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
-import torch
-from astropy import units as u
 from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import Table
 from survey_stubs import HOSTILE, configuration, inputs, result, stub
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import CENTER, SIDE, calints
 from pyklip_diffrender.cli import main
-from pyklip_diffrender.detection import Candidates, with_planets
-from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.errors import (
-    CorruptFileError,
-    IncompatibleSetupError,
-    RefinementError,
-)
-from pyklip_diffrender.reduction import ReduceOptions
-from pyklip_diffrender.refinement import FrameFit, GaussNewton
-from pyklip_diffrender.surveys import (
-    execution,
-    survey_page,
-)
-from pyklip_diffrender.surveys import (
-    execution as work,
-)
-from pyklip_diffrender.surveys import (
-    jobs as folders,
-)
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.surveys import execution
+from pyklip_diffrender.surveys import jobs as folders
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
-from pyklip_diffrender.surveys.execution import Work
-from pyklip_diffrender.surveys.jobs import Injection, Job, jobs_of
-from pyklip_diffrender.surveys.survey_page import COLUMNS, table_of
-
-ROOT = Path(__file__).resolve().parents[1]
-
-CURVE = ("sigmas", "separation_arcsec", "contrast")
+from pyklip_diffrender.surveys.jobs import jobs_of
 
 PLANETS = {"contrasts": [1e-5, 3e-6], "separations": [0.5, 1.0], "angles": [0, 90.0]}
 
 
 @pytest.fixture
-def _drawn() -> None:
+def _drawn():
     """For tests that need the picture of the page, which takes a second."""
 
 
 @pytest.fixture(autouse=True)
-def _not_drawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def _not_drawn(request, monkeypatch):
     if "_drawn" not in request.fixturenames:
         monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"no picture")
 
 
-def planned(config: dict[str, Any]) -> list[Job]:
+def planned(config):
     return jobs_of(read_config(config))
 
 
-def hidden(output: Path) -> list[str]:
+def hidden(output):
     """What is left of jobs that never ended."""
     return [path.name for path in (output / "jobs").iterdir() if path.name.startswith(".")]
 
 
-# -- configuration ---------------------------------------------------------------------------------
-
-
-def test_a_file_says_the_same_as_a_mapping(tmp_path: Path) -> None:
-    config = inputs(tmp_path)
-    path = configuration(tmp_path / "survey.toml", config)
-    assert read_config(path) == read_config(config)
-    assert [job.key for job in planned(config)] == [job.key for job in jobs_of(read_config(path))]
-
-
-def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
     inputs(tmp_path / "data", 1)
     path = tmp_path / "data" / "survey.toml"
     path.write_text('[[sequence]]\nfiles = "star0_calints.fits"\nopd = "opd.fits"\n')
@@ -101,7 +61,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
     assert sequence.name == "star0_calints"
 
 
-def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
+def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
     config = inputs(tmp_path, 2)
     config["options"] = {"threshold": 6, "size": 48, "settings": {"cycles": 8, "robust": inf}}
     config["injections"] = PLANETS
@@ -115,7 +75,7 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
     assert set(run_survey(config, tmp_path / "out", stub)["status"]) == {"finished"}
 
 
-def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path: Path) -> None:
+def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path):
     config = inputs(tmp_path, 1)
     plain = config["sequence"][0]
     config["sequence"] += [{**plain, "name": n, n: True} for n in ("wide", "disk", "completeness")]
@@ -164,9 +124,7 @@ def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path:
         ((1,), "code", "import os", ["sequence 2: got the key 'code'", "one of files"]),
     ],
 )  # fmt: skip
-def test_a_mistake_is_named_before_anything_is_done(
-    tmp_path: Path, where: tuple[int, ...], key: str, value: Any, words: list[str]
-) -> None:
+def test_a_mistake_is_named_before_anything_is_done(tmp_path, where, key, value, words):
     config = inputs(tmp_path / "data", 2)
     place = config["sequence"][where[0]] if where else config
     place[key] = value
@@ -179,23 +137,8 @@ def test_a_mistake_is_named_before_anything_is_done(
     assert not (tmp_path / "out").exists()
 
 
-def test_all_mistakes_are_named_at_once(tmp_path: Path) -> None:
-    config = {"workers": "two", "sequence": [{"files": []}, 3, {"opd": "x", "size": 1}]}
-    with pytest.raises(IncompatibleSetupError) as raised:
-        read_config(config)
-    text = str(raised.value)
-    for word in (
-        "workers",
-        "sequence 1: files",
-        "sequence 1: opd",
-        "sequence 2",
-        "sequence 3: size",
-    ):
-        assert word in text
-
-
 @pytest.mark.parametrize("content", [b"a = [", b"\xff", b"[" * 5000, b"a = 1\na = 2"])
-def test_a_file_that_is_not_toml(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_not_toml(tmp_path, content):
     path = tmp_path / "survey.toml"
     with pytest.raises(CorruptFileError, match=r"survey\.toml: cannot be read"):
         read_config(path)
@@ -204,54 +147,14 @@ def test_a_file_that_is_not_toml(tmp_path: Path, content: bytes) -> None:
         read_config(path)
 
 
-def test_the_same_job_twice_is_a_mistake(tmp_path: Path) -> None:
+def test_the_same_job_twice_is_a_mistake(tmp_path):
     config = inputs(tmp_path, 1)
     config["sequence"].append({**config["sequence"][0], "name": "again"})
     with pytest.raises(IncompatibleSetupError, match="again: got the same inputs and options"):
         planned(config)
 
 
-def calints_file(path: Path, star: str, day: str | None, *, reference: bool = False) -> None:
-    primary = fits.PrimaryHDU()
-    primary.header.update({"FILTER": "F444W", "TARGPROP": star, "IS_PSF": reference})
-    if day is not None:
-        primary.header["DATE-BEG"] = f"{day}T00:00:00"
-    data = np.random.default_rng(1).normal(10, 2, (2, 8, 10)).astype(np.float32)
-    planes = {"SCI": data, "ERR": np.ones_like(data), "DQ": np.zeros(data.shape, dtype=np.uint32)}
-    hdus = [primary, *(fits.ImageHDU(array, name=name) for name, array in planes.items())]
-    hdus[1].header.update(
-        {"BUNIT": "MJy/sr", "PIXAR_A2": 0.00396, "CRPIX1": 6.0, "CRPIX2": 5.0,
-         "ROLL_REF": 100.0, "V3I_YANG": -0.5, "VPARITY": -1}
-    )  # fmt: skip
-    fits.HDUList(hdus).writeto(path, overwrite=True)
-
-
-def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path: Path) -> None:
-    config = inputs(tmp_path, 1)
-    maps = tmp_path / "maps"
-    maps.mkdir()
-    for day in ("01", "11", "29"):
-        hdu = fits.PrimaryHDU(1e-8 * np.random.default_rng(1).normal(size=(16, 16)))
-        hdu.header["BUNIT"] = "m"
-        hdu.header["DATE-OBS"] = f"2022-08-{day}T00:00:00"
-        hdu.writeto(maps / f"map{day}.fits")
-    (maps / "broken.fits").write_bytes(b"nothing")
-    config["sequence"][0]["opd"] = str(maps)
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    config["sequence"][0]["files"] = str(frames)
-    calints_file(frames / "target.fits", "HD-1", None)
-    with pytest.raises(IncompatibleSetupError, match="no date"):
-        planned(config)
-    # The reference star was observed when another map was the nearest.
-    calints_file(frames / "target.fits", "HD-1", "2022-08-15")
-    calints_file(frames / "reference.fits", "HD-2", "2022-08-01", reference=True)
-    (job,) = planned(config)
-    assert job.opd == str(maps / "map11.fits")
-    assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
-
-
-def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path: Path) -> None:
+def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path):
     config = inputs(tmp_path, 1)
     frames = tmp_path / "frames"
     for k, day in enumerate(("2022-10-03", "2022-10-04", "2023-12-01")):
@@ -275,7 +178,25 @@ def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path: Path) -> None:
     assert [each.name for each in planned(config)] == ["HD 1", "HD 1"]
 
 
-def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path):
+    config = inputs(tmp_path, 1)
+    maps, frames = tmp_path / "maps", tmp_path / "frames"
+    maps.mkdir()
+    for day in ("01", "11", "29"):
+        header = fits.Header({"BUNIT": "m", "DATE-OBS": f"2022-08-{day}T00:00:00"})
+        opd = dr.random_opd(1, npix=16).data
+        fits.PrimaryHDU(opd, header).writeto(maps / f"map{day}.fits")
+    config["sequence"][0] |= {"opd": str(maps), "files": str(frames)}
+    calints(frames / "target.fits", date="2022-08-15T00:00:00")
+    # The reference star was observed when another map was the nearest.
+    cards = {"IS_PSF": True}
+    calints(frames / "star.fits", "HD 2", observation=2, date="2022-08-01T00:00:00", cards=cards)
+    (job,) = planned(config)
+    assert job.opd == str(maps / "map11.fits")
+    assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
+
+
+def test_a_sequence_may_have_no_map(tmp_path, monkeypatch):
     (tmp_path / "flat").mkdir()
     monkeypatch.chdir(tmp_path)
     config = inputs(tmp_path, 1)
@@ -287,10 +208,7 @@ def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert job.key != mapped.key
 
 
-# -- names of jobs ---------------------------------------------------------------------------------
-
-
-def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path: Path) -> None:
+def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path):
     config, output = inputs(tmp_path / "a", 1), tmp_path / "out"
     config["sequence"][0] |= {"name": "β Pic, F444W"}
     config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
@@ -302,7 +220,7 @@ def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path: Path) -
     assert jobs[1].base_folder == jobs[0].folder
     ran = []
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         ran.append(job.folder)
         return stub(job, folder)
 
@@ -317,19 +235,7 @@ def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path: Path) -
     assert f'"jobs/{names[0]}/report.html"' in page
 
 
-def test_tables_have_units_and_descriptions(tmp_path: Path) -> None:
-    run_survey(inputs(tmp_path / "a", 1), tmp_path / "out", stub)
-    table = Table.read(tmp_path / "out/results.ecsv")
-    for name in ("separation_arcsec", "injected_separation_arcsec"):
-        assert table[name].unit == u.arcsec
-    assert table["position_angle_deg"].unit == table["injected_angle_deg"].unit == u.deg
-    assert (table["seconds"].unit, table["peak_memory_bytes"].unit) == (u.s, u.byte)
-    # Limits are contrasts.
-    assert all(table[name].unit is None for name in table.colnames if name.startswith("limit"))
-    assert "0.5 arcsec" in table["limit_0.5_arcsec"].description
-
-
-def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path: Path) -> None:
+def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path):
     config = inputs(tmp_path / "a", 1)
     (job,) = planned(config)
     moved = inputs(tmp_path / "b", 1)
@@ -342,21 +248,10 @@ def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path: Path
     assert [each.key for each in planned(config)] != [job.key]
 
 
-def test_a_new_version_is_a_new_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = inputs(tmp_path, 1)
-    (old,) = planned(config)
-    monkeypatch.setattr("pyklip_diffrender.surveys.jobs.__version__", "99.0")
-    (new,) = planned(config)
-    assert new.key != old.key
-
-
-# -- running ---------------------------------------------------------------------------------------
-
-
-def test_finished_jobs_are_not_run_again(tmp_path: Path) -> None:
+def test_finished_jobs_are_not_run_again(tmp_path):
     config, output, ran = inputs(tmp_path / "data"), tmp_path / "out", []
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         ran.append(job.name)
         return stub(job, folder)
 
@@ -375,11 +270,11 @@ def test_finished_jobs_are_not_run_again(tmp_path: Path) -> None:
     assert hidden(output) == []
 
 
-def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
+def test_a_failure_is_a_row_and_is_tried_again(tmp_path):
     config, output = inputs(tmp_path / "data"), tmp_path / "out"
     config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         (folder / "half").write_text("a product")
         if job.name.startswith("star1"):
             raise ZeroDivisionError("at the second star")
@@ -403,98 +298,8 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
     assert hidden(output) == []
 
 
-def test_an_injection_starts_from_the_finished_reduction(tmp_path: Path) -> None:
-    config = inputs(tmp_path / "data", 1)
-    config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
-
-    def work(job: Job, folder: Path) -> dict[str, Any]:
-        if job.injection:
-            assert (folder.parent / str(job.base_folder) / "report.html").exists()
-        return stub(job, folder)
-
-    table = run_survey(config, tmp_path / "out", work)
-    assert list(table["status"]) == ["finished"] * 2
-    assert table["injected_contrast"].tolist() == [None, 1e-5]
-    assert table["recovered_contrast"].tolist() == [None, 1.1e-5]
-    assert table["recovered"].tolist() == [None, True]
-
-
-def test_what_another_survey_published_meanwhile_stays(tmp_path: Path) -> None:
-    (job,) = planned(inputs(tmp_path / "data", 1))
-    jobs = folders.prepare(tmp_path / "out")
-    # In a folder of the same name, because its inputs are the same.
-    rival = replace(job, opd="rival")
-
-    def work(inner: Job, folder: Path) -> dict[str, Any]:
-        if inner.opd != "rival":
-            assert execution.run_job(rival, jobs, work)["status"] == "finished"
-        return stub(inner, folder)
-
-    assert execution.run_job(job, jobs, work)["status"] == "finished"
-    record = folders.read_record(jobs / job.folder)
-    assert record is not None
-    assert record["job"]["opd"] == "rival"
-    assert hidden(tmp_path / "out") == []
-
-
-def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
-    jobs = folders.prepare(tmp_path)
-    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
-        pass
-    mine = folders.staging(jobs, "a" * 64)
-    left = jobs / mine.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-")
-    elsewhere = left.with_name(f"{left.name}x")
-    for each in (left, elsewhere):
-        each.mkdir()
-        (each / "half").write_text("half")
-    # Another machine may run this job, whatever its clock or ours says.
-    os.utime(elsewhere, (0, 0))
-    folders.clean(jobs)
-    assert sorted(jobs.iterdir()) == sorted([mine, elsewhere])
-
-
-def test_containers_with_one_host_name_leave_each_other_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first process of another container has a number that means nothing here."""
-    jobs = folders.prepare(tmp_path)
-    here = os.stat
-    folders._place.cache_clear()
-    monkeypatch.setattr(
-        os, "stat",
-        lambda path, **options: SimpleNamespace(st_ino=1)
-        if path == "/proc/self/ns/pid" else here(path, **options),
-    )  # fmt: skip
-    theirs = folders.staging(jobs, "a" * 64)
-    monkeypatch.undo()
-    folders._place.cache_clear()
-    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
-        pass
-    foreign = theirs.rename(str(theirs).replace(f"-{os.getpid()}-", f"-{dead.pid}-"))
-    folders.clean(jobs)
-    assert list(jobs.iterdir()) == [foreign]
-
-
-def test_a_message_in_another_encoding_stops_nothing(tmp_path: Path) -> None:
-    config, output = inputs(tmp_path / "data", 2), tmp_path / "out"
-
-    def work(job: Job, folder: Path) -> dict[str, Any]:
-        if job.name.startswith("star1"):
-            # As Python quotes a Latin-1 name of a file.
-            raise ValueError("no such file: " + os.fsdecode(b"caf\xe9.fits"))
-        return stub(job, folder)
-
-    for _ in range(2):
-        table = run_survey(config, output, work)
-        assert sorted(table["status"]) == ["failed", "finished"]
-    (message,) = table["message"][table["status"] == "failed"]
-    assert message == r"ValueError: no such file: caf\udce9.fits"
-    assert message in Table.read(output / "results.ecsv")["message"]
-    assert list(run_survey(config, output, stub)["status"]) == ["finished"] * 2
-
-
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])
-def test_a_damaged_record_is_a_missing_job(tmp_path: Path, damage: str) -> None:
+def test_a_damaged_record_is_a_missing_job(tmp_path, damage):
     config, output = inputs(tmp_path / "data", 1), tmp_path / "out"
     (name,) = run_survey(config, output, stub)["folder"]
     record = output / "jobs" / name / "job.json"
@@ -504,10 +309,10 @@ def test_a_damaged_record_is_a_missing_job(tmp_path: Path, damage: str) -> None:
     assert json.loads(record.read_text())["products"] == whole["products"]
 
 
-def test_frames_that_change_on_the_way_are_noticed(tmp_path: Path) -> None:
+def test_frames_that_change_on_the_way_are_noticed(tmp_path):
     config = inputs(tmp_path / "data", 2)
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         Path(config["sequence"][1]["files"]).write_bytes(b"other")
         return stub(job, folder)
 
@@ -517,7 +322,7 @@ def test_frames_that_change_on_the_way_are_noticed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["file", "version", "output"])
-def test_a_worker_that_sees_something_else_says_so(tmp_path: Path, what: str) -> None:
+def test_a_worker_that_sees_something_else_says_so(tmp_path, what):
     (job,) = planned(inputs(tmp_path / "data", 1))
     jobs = folders.prepare(tmp_path / "out")
     words = {"file": "does not see this file", "version": "99.0", "output": "see this folder"}
@@ -534,10 +339,7 @@ def test_a_worker_that_sees_something_else_says_so(tmp_path: Path, what: str) ->
     assert jobs.exists() == (what != "output")
 
 
-# -- results ---------------------------------------------------------------------------------------
-
-
-def test_the_tables_say_the_same(tmp_path: Path) -> None:
+def test_the_tables_say_the_same(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     config = inputs(tmp_path / "data", 2)
     config["sequence"][0]["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
@@ -557,10 +359,10 @@ def test_the_tables_say_the_same(tmp_path: Path) -> None:
     assert rows[0]["peak_memory_bytes"] > 1e6
 
 
-def test_the_tables_are_there_while_the_survey_runs(tmp_path: Path) -> None:
+def test_the_tables_are_there_while_the_survey_runs(tmp_path):
     config, output, seen = inputs(tmp_path / "data"), tmp_path / "out", []
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         path = output / "results.ecsv"
         seen.append(list(Table.read(path)["status"]) if path.exists() else [])
         return stub(job, folder)
@@ -571,23 +373,23 @@ def test_the_tables_are_there_while_the_survey_runs(tmp_path: Path) -> None:
 
 
 class Tags(HTMLParser):
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
 
 
 @pytest.mark.usefixtures("_drawn")
-def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path: Path) -> None:
+def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path):
     config = inputs(tmp_path / "data", 2)
     config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
     for k, name in enumerate((HOSTILE, "$\\frac{_a$")):
         config["sequence"][k]["name"] = name
 
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+    def work(job, folder):
         if job.name == HOSTILE and job.injection:
             raise ValueError(HOSTILE)
         return {**stub(job, folder), **result(HOSTILE), "filter": HOSTILE, "fit_status": HOSTILE}
@@ -606,29 +408,8 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path: Path) ->
         assert (output / link).exists()
 
 
-@pytest.mark.usefixtures("_drawn")
-def test_a_survey_of_many_stars_has_one_picture(tmp_path: Path) -> None:
-    (job,) = planned(inputs(tmp_path / "data", 1))
-    record = {"status": "finished", "result": result(), "seconds": 1.0}
-    rows = [(replace(job, name=f"star {k}"), record) for k in range(12)]
-    text = survey_page.page([*rows, (job, None)])
-    assert "12 of 13 jobs finished, 1 not finished yet" in text
-    assert "12 sequences reduced, 12 companion candidates in 12 of them." in text
-
-
-# -- where it runs ---------------------------------------------------------------------------------
-
-
-def test_the_table_shows_its_contrasts_on_80_columns() -> None:
-    values = {"name": "HIP-65426_F444W", "status": "finished", "contrast": 3.6276222428e-4,
-              "snr": 70.0387387, "message": "none", "key": "0123456789abcdef"}  # fmt: skip
-    shown = table_of([dict.fromkeys(COLUMNS) | values]).pformat(max_width=80)
-    assert max(map(len, shown)) <= 80
-    assert {"3.63e-04", "70.0"} <= set(shown[-1].split())
-
-
 @pytest.mark.parametrize("missing", ["dask", "pyarrow"])
-def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+def test_without_the_extra(tmp_path, monkeypatch, missing):
     config = inputs(tmp_path / "data", 1)
     for name in [each for each in sys.modules if each.split(".")[0] == missing]:
         monkeypatch.setitem(sys.modules, name, None)
@@ -645,66 +426,15 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, miss
     assert (tmp_path / "out" / "results.parquet").exists() == (missing != "pyarrow")
 
 
-def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("mine")
-    with pytest.raises(IncompatibleSetupError, match=r"output: got .*out, expected a folder"):
-        run_survey(inputs(tmp_path / "data", 1), tmp_path / "out", stub)
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-def test_a_table_that_cannot_be_written_stops_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    config, output = inputs(tmp_path / "data"), tmp_path / "out"
-    (output / "results.ecsv").mkdir(parents=True)
-    with pytest.raises(IncompatibleSetupError, match="Is a directory"):
-        run_survey(config, output, stub)
-    assert "Is a directory" in caplog.text
-    (output / "results.ecsv").rmdir()
-    assert list(run_survey(config, output, pytest.fail)["status"]) == ["finished"] * 3
-
-
-def test_a_job_that_another_disk_has_is_a_failure(tmp_path: Path) -> None:
-    (job,) = planned(inputs(tmp_path / "data", 1))
-    jobs = folders.prepare(tmp_path / "out")
-
-    class Future:
-        def result(self) -> dict[str, Any]:
-            return {"status": "finished", "host": "node7"}
-
-    record = execution._record_of(Future(), job, jobs, patience=0)
-    assert record["status"] == "failed"
-    assert "node7 wrote its products to another disk" in record["message"]
-
-
-def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path: Path) -> None:
-    (job,) = planned(inputs(tmp_path / "data", 1))
-    jobs = folders.prepare(tmp_path / "out")
-
-    class Future:
-        def result(self) -> dict[str, Any]:
-            raise CancelledError
-
-    with pytest.raises(RefinementError, match="scheduler was lost"):
-        execution._record_of(Future(), job, jobs)
-    record = execution.run_job(job, jobs, stub)
-    assert execution._record_of(Future(), job, jobs) == record
-
-
 @pytest.fixture
-def do(monkeypatch: pytest.MonkeyPatch) -> Callable[[Work], None]:
+def do(monkeypatch):
     """Give the command other work than reductions."""
     return partial(monkeypatch.setattr, "pyklip_diffrender.surveys.execution.reduce_job")
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_the_command_says_what_came_of_it(
-    tmp_path: Path,
-    do: Callable[[Work], None],
-    capsys: pytest.CaptureFixture[str],
-    broken: bool,
-) -> None:
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+def test_the_command_says_what_came_of_it(tmp_path, do, capsys, broken):
+    def work(job, folder):
         if broken and job.name.startswith("star1"):
             raise ValueError("no such star")
         return stub(job, folder)
@@ -724,10 +454,8 @@ def test_the_command_says_what_came_of_it(
     assert f"wrote {output / 'survey.html'}" in said
 
 
-def test_an_interrupted_command_says_that_it_can_go_on(
-    tmp_path: Path, do: Callable[[Work], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    def work(job: Job, folder: Path) -> dict[str, Any]:
+def test_an_interrupted_command_says_that_it_can_go_on(tmp_path, do, capsys):
+    def work(job, folder):
         if job.name.startswith("star1"):
             raise KeyboardInterrupt
         return stub(job, folder)
@@ -741,145 +469,8 @@ def test_an_interrupted_command_says_that_it_can_go_on(
     assert list(table["status"]) == ["finished", "waiting", "waiting"]
 
 
-def test_jobs_aim_at_less_than_the_memory_of_their_worker(
-    tmp_path: Path, do: Callable[[Work], None]
-) -> None:
-    limits = []
-
-    def work(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
-        limits.append(memory)
-        return stub(job, folder)
-
-    do(work)
-    config = inputs(tmp_path / "data", 1)
-    survey({**config, "memory_limit": "4 GB"}, tmp_path / "limited")
-    survey(config, tmp_path / "free")
-    assert limits == [3.2e9, None]
-
-
-def test_a_configuration_with_mistakes_is_an_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "survey.toml"
-    path.write_text("workers = -1")
-    assert main(["survey", str(path), "-o", str(tmp_path / "out")]) == 1
-    said = capsys.readouterr().err
-    assert "survey.toml: nothing was started:\n  workers: got -1" in said
-    assert not (tmp_path / "out").exists()
-
-
-def test_public_name() -> None:
-    assert dr.survey is survey
-
-
-# -- the real work ---------------------------------------------------------------------------------
-
-ROLLS = (20.0, 60.0)
-
-
-def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
-    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    scene, opd = dr.Scene(dr.Star(exposure=200.0)), dr.random_opd(1, npix=128)
-    star = dr.simulate(model, scene, opd, seed=5)
-    nothing = np.zeros((32, 32))
-    values = {"flux": np.array([scene.star.photons]), "background": np.zeros(1)}
-    frames = [
-        FrameFit(
-            model, replace(star, position_angles=np.array([roll])), {}, opd.data, nothing,
-            nothing, values, {}, nothing, np.zeros(0),
-        )
-        for roll in ROLLS
-    ]  # fmt: skip
-    planet = Injection(1e-4, 0.6, 100.0)
-    science = with_planets(frames, [work._planet(planet, ROLLS[0])])
-    assert len(science) == 2
-    for roll, frame in zip(ROLLS, science, strict=True):
-        light = (frame.data - star.data)[0]
-        # Position angles of planets in a scene are counted from +y of the frame.
-        truth = dr.Planet(planet.contrast, planet.separation, planet.angle - roll)
-        expected = dr.simulate(model, replace(scene, planets=(truth,)), opd, seed=5).data[0]
-        x, y = np.round(np.array(truth.offset) / 0.0624 + 15.5).astype(int)
-        core = (slice(y - 2, y + 3), slice(x - 2, x + 3))
-        assert light[core].max() == light.max()
-        # The photon noise of the star under the planet is 3 % of the planet.
-        assert light[core].sum() == pytest.approx((expected - star.data[0])[core].sum(), rel=0.1)
-
-
-def test_a_disk_and_the_whole_frames_are_part_of_the_job(tmp_path: Path) -> None:
-    config = inputs(tmp_path, 1)
-    # Other fields than those asked for are those of the preset in the filter of the frames.
-    settings = GaussNewton.nircam("F356W", max_iterations=7)
-    ones = np.ones((4, 4))
-    frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F356W")
-    for name in ("wide", "disk"):
-        options = {name: True, "star_flux": 0.4, "settings": {"max_iterations": 7}}
-        (job,) = planned({**config, "options": options})
-        expected = ReduceOptions(size=40, star_flux=0.4, settings=settings, **{name: True})
-        assert work._options(job, frame) == expected
-        assert work._options(job, frame, wide=False).wide is False
-
-
-def test_the_result_of_a_job_is_that_of_the_largest_field() -> None:
-    wide_field = {"candidates": [{"snr": 7.0}], "contrast_curve": {k: [] for k in CURVE}}
-    summary = {
-        **result(), "status": {"name": "CONVERGED"}, "fit": {"reduced_chi2": 1, "error_factor": 1},
-        "contrast_curve": {k: [1.0] for k in CURVE}, "frames": [], "wide_field": wide_field,
-    }  # fmt: skip
-    record = work._result(summary)
-    assert [each["false_alarm_probability"] for each in record["candidates"]] == [None]
-    assert record["curve"] == wide_field["contrast_curve"]
-    record = work._result({**summary, "wide_field": None})
-    assert record["curve"] == summary["contrast_curve"]
-    assert [each["snr"] for each in record["candidates"]] == [30.0]
-
-
-def test_a_planet_is_injected_into_the_frames_with_their_disk() -> None:
-    ones = np.ones((30, 30))
-    cut = dr.Observation.from_arrays(3 * ones, ones, pixelscale=0.063).cutout(8)
-    frame = FrameFit(
-        cast(Any, None), replace(cut, data=cut.data - 2), {}, ones, ones, ones, {}, {}, ones,
-        np.zeros(0),
-    )  # fmt: skip
-    (with_disk,) = work._with_disk([frame], [cut])
-    assert (with_disk.observation.data == 3).all()
-
-
-def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
-    planet = Injection(1e-4, 0.6, 100.0)
-    x, y = dr.Planet(1e-4, 0.6, 100.0 - 20.0).offset
-
-    def searched(*rows: tuple[float, float, float]) -> Any:
-        """Candidates of x, y and contrast, with an error of 1e-5."""
-        table = np.reshape(rows, (-1, 3))
-        errors = torch.full((len(table),), 1e-5, dtype=torch.float64)
-        sources = replace(
-            Candidates.at(table[:, :2], table[:, 2]),
-            covariance=torch.diag(errors.repeat(3) ** 2),
-            detection_errors=errors,
-        )
-
-        def measure(offsets: list[Any]) -> QTable:
-            np.testing.assert_allclose(offsets, [[x, y]])
-            return QTable({"contrast": [4.5e-5], "contrast_error": [2e-5], "snr": [4.5]})
-
-        star = SimpleNamespace(frames=[SimpleNamespace(flux=3.0)])
-        detection = SimpleNamespace(
-            north=20.0, sources=sources, error_factor=ErrorFactor.constant(1.0), measure=measure,
-            fits=[star],
-        )  # fmt: skip
-        return SimpleNamespace(detection=detection)
-
-    other = (0.5, 0.5, 7e-5)
-    recovered = work._recovered(searched(other, (x + 0.03, y, 9e-5)), planet, 2.0)
-    expected = {"contrast": 1.35e-4, "contrast_error": 1.5e-5, "snr": 9.0, "detected": True}
-    assert recovered == pytest.approx(expected)
-    for rows in ((other,), ()):
-        recovered = work._recovered(searched(*rows), planet, 3.0)
-        assert (recovered["snr"], recovered["detected"]) == (4.5, False)
-
-
 @pytest.mark.slow
-def test_files_with_and_without_a_planet(tmp_path: Path) -> None:
+def test_files_with_and_without_a_planet(tmp_path):
     """From calibrated files to the tables; test_slurm.py has a job with a real frame."""
     first = dr.Sequence.from_files([calints(tmp_path / "blank_calints.fits")]).science[0]
     model = dr.model_for(first, 41)

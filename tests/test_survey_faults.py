@@ -33,9 +33,7 @@ restarted without end. The others take long, and break the same code as those th
         for name in (*WITH_DASK, "read_only", "full_disk", "file_limit", "damaged_inputs")
     ],
 )
-def test_nothing_is_half_done_and_nothing_finished_is_lost(
-    scenario: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, monkeypatch):
     if scenario in WITH_DASK and importlib.util.find_spec("distributed") is None:
         pytest.skip("needs dask.distributed")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))  # Of the surveys, which are processes.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +14,6 @@ from scipy.ndimage import gaussian_filter
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern.measure import (
     lacks_pattern,
     learn_systematics,
@@ -23,14 +21,13 @@ from pyklip_diffrender.pattern.measure import (
     pattern_pedestal,
     pattern_size,
 )
-from pyklip_diffrender.refinement import GaussNewton, Refinement, Status
+from pyklip_diffrender.refinement import GaussNewton, Status
 from pyklip_diffrender.refinement.fitting import refine_again
-from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.opd import as_opd_map, random_opd
+from pyklip_diffrender.wavefront.opd import random_opd
 
 NPIX, SIZE, FLUX, READ_NOISE = 64, 32, 3e10, 42.0
 BASIS = JointBasis([SegmentMotions(), FourierModes(4)])
@@ -38,10 +35,8 @@ RMS = 0.06
 PLANET = Planet(3e-5, 0.6, 0.0)
 MIDDLE = ((SIZE - 1) / 2, (SIZE - 1) / 2)
 
-# -- where the pattern is put --------------------------------------------------------------------
 
-
-def frame(shape: tuple[int, int], center: tuple[float, float], **details: object) -> Observation:
+def frame(shape, center, **details):
     ones = np.ones(shape)
     return Observation.from_arrays(ones, ones, pixelscale=0.06, center=center, **details)
 
@@ -49,7 +44,7 @@ def frame(shape: tuple[int, int], center: tuple[float, float], **details: object
 @pytest.mark.parametrize("shape", [(9, 12), (4, 5), (20, 17)], ids=["same", "smaller", "larger"])
 @pytest.mark.parametrize("x", [-30.0, -12.0, -3.0, 0.0, 0.3, 5.0, 12.0, 40.0])
 @pytest.mark.parametrize("y", [-25.0, -9.0, -2.0, 0.0, 4.0, 9.0, 33.0])
-def test_pixels_are_matched_by_the_star(shape: tuple[int, int], x: float, y: float) -> None:
+def test_pixels_are_matched_by_the_star(shape, x, y):
     """Cutouts that stick out on every side, or do not meet the pattern at all."""
     pattern = 1.0 + np.arange(9 * 12).reshape(9, 12)
     known = Systematics(pattern, 0.01 * pattern, (6.0, 4.0), unknown=0.5)
@@ -66,9 +61,7 @@ def test_pixels_are_matched_by_the_star(shape: tuple[int, int], x: float, y: flo
 
 
 @pytest.mark.parametrize("corner", [(600, 1600), (602, 1597), (597, 1604), (590, 1590)])
-def test_pixels_are_matched_on_the_detector_where_both_know_theirs(
-    corner: tuple[int, int],
-) -> None:
+def test_pixels_are_matched_on_the_detector_where_both_know_theirs(corner):
     """A pixel keeps its flat field wherever in the frame the star is."""
     rows, columns = np.mgrid[1600:1609, 600:612]
     serial = 1.0 + 1000 * rows + columns
@@ -82,7 +75,7 @@ def test_pixels_are_matched_on_the_detector_where_both_know_theirs(
     np.testing.assert_array_equal(error, np.where(known, 0.01 * serial, 0.5))
 
 
-def test_another_filter_and_unequal_arrays_are_refused() -> None:
+def test_another_filter_and_unequal_arrays_are_refused():
     zeros = np.zeros((9, 12))
     known = Systematics(zeros, zeros, (6.0, 4.0), 0.5, filter="F444W")
     known.at(frame((9, 12), (6.0, 4.0), filter="F444W"))
@@ -93,21 +86,18 @@ def test_another_filter_and_unequal_arrays_are_refused() -> None:
         Systematics(zeros, zeros[:, 1:], (6.0, 4.0), 0.5)
 
 
-# -- fits ----------------------------------------------------------------------------------------
-
-
 @cache
-def model() -> OpticalSystem:
+def model():
     return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
 
 
 @cache
-def before() -> np.ndarray:
+def before():
     return random_opd(3, npix=NPIX).data
 
 
 @cache
-def later() -> np.ndarray:
+def later():
     generator = torch.Generator().manual_seed(3)
     size = torch.where(BASIS.frequencies == 0, 1.0, 0.15)
     change = size * torch.randn(len(BASIS), dtype=torch.float64, generator=generator)
@@ -115,14 +105,14 @@ def later() -> np.ndarray:
 
 
 @cache
-def pattern(seed: int = 1) -> np.ndarray:
+def pattern(seed=1):
     """As smooth as speckles are, rms 6 %."""
     drawn = np.random.default_rng(seed).normal(size=(SIZE, SIZE))
     smooth = gaussian_filter(drawn, 1.0, mode="wrap")
     return RMS * smooth / smooth.std()
 
 
-def light(planet: Planet | None = None, shift: tuple[int, int] = (0, 0)) -> np.ndarray:
+def light(planet=None, shift=(0, 0)):
     """Of the star, or of a planet, moved by whole pixels."""
     scale = model().detector.pixelscale
     moved = {"detector_shift": (shift[0] * scale[0], shift[1] * scale[1])}
@@ -131,7 +121,7 @@ def light(planet: Planet | None = None, shift: tuple[int, int] = (0, 0)) -> np.n
     return planet.contrast * FLUX * model()(later(), planet.offset, **moved).numpy()
 
 
-def observed(expected: np.ndarray, seed: int, **details: object) -> Observation:
+def observed(expected, seed, **details):
     rng = np.random.default_rng(seed)
     counts = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
     error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
@@ -139,20 +129,18 @@ def observed(expected: np.ndarray, seed: int, **details: object) -> Observation:
     return Observation.from_arrays(counts, error, pixelscale=scale, **details)
 
 
-def known(error: float = 1e-3, seed: int = 1) -> Systematics:
+def known(error=1e-3, seed=1):
     return Systematics(pattern(seed), np.full((SIZE, SIZE), error), MIDDLE, RMS, name="measured")
 
 
-def fitted(observation: Observation, systematics: Systematics | None) -> Refinement:
+def fitted(observation, systematics):
     settings = GaussNewton(basis=BASIS, response_npix=NPIX)
     return dr.refine(model(), observation, before(), settings=settings, systematics=systematics)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("separation", "angle"), [(0.6, 300.0), (0.8, 100.0)])
-def test_a_pattern_hides_planets_and_is_taken_out_where_it_is_known(
-    separation: float, angle: float
-) -> None:
+def test_a_pattern_hides_planets_and_is_taken_out_where_it_is_known(separation, angle):
     planet = Planet(8e-6, separation, angle)
     spoilt = observed(light() * (1 + pattern()) + light(planet), 50)
     without, with_it, wrong = (fitted(spoilt, each) for each in (None, known(), known(seed=2)))
@@ -181,7 +169,7 @@ def test_a_pattern_hides_planets_and_is_taken_out_where_it_is_known(
 
 
 @pytest.mark.slow
-def test_the_error_of_a_pattern_counts_as_noise() -> None:
+def test_the_error_of_a_pattern_counts_as_noise():
     """The frames' own pattern differs from the one that was measured, by what its error says."""
     drawn = 0.02 * np.random.default_rng(8).normal(size=(SIZE, SIZE))
     spoilt = observed(light() * (1 + pattern() + drawn) + light(PLANET), 51)
@@ -196,22 +184,7 @@ def test_the_error_of_a_pattern_counts_as_noise() -> None:
     assert row["contrast_error"] > 1.2 * exact["contrast_error"]
 
 
-@pytest.mark.slow
-def test_the_pattern_follows_the_star_over_the_detector() -> None:
-    """Where the pattern was not measured its standard deviation counts."""
-    shift = (3, -2)
-    there = np.roll(pattern(), shift[::-1], axis=(0, 1))
-    center = (MIDDLE[0] + shift[0], MIDDLE[1] + shift[1])
-    spoilt = observed(light(shift=shift) * (1 + there) + light(PLANET, shift), 52, center=center)
-    fit = fitted(spoilt, known())
-    assert fit.status is Status.CONVERGED
-    assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.13)
-    assert fitted(replace(spoilt, center=np.array([MIDDLE])), known()).reduced_chi2 > 30
-    row = dr.measure(fit, [PLANET.offset])[0]
-    assert abs(row["contrast"] - PLANET.contrast) < 3 * row["contrast_error"]
-
-
-def test_frames_fitted_together_have_the_pattern_each_at_its_star() -> None:
+def test_frames_fitted_together_have_the_pattern_each_at_its_star():
     shifts = ((0, 0), (2, 1))
     frames = [
         observed(
@@ -229,14 +202,11 @@ def test_frames_fitted_together_have_the_pattern_each_at_its_star() -> None:
 
 
 @pytest.mark.parametrize("size", [1.0, 0.6, 0.0])
-def test_frames_tell_how_much_of_a_pattern_they_show(
-    size: float, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_tell_how_much_of_a_pattern_they_show(size, caplog):
     """Another flat field may have removed a part of the pattern, or all of it."""
     spoilt = observed(light() * (1 + size * pattern()) + light(PLANET), 53)
     fit = fitted(spoilt, known(0.01))
     measured = pattern_size(fit)
-    assert measured is not None
     assert measured[0] == pytest.approx(size, abs=0.1)
     assert 0 < measured[1] < 0.05
     assert lacks_pattern(fit) is (size < 0.5)
@@ -245,7 +215,7 @@ def test_frames_tell_how_much_of_a_pattern_they_show(
     assert all("flat-field pattern of measured" in each for each in warnings)
 
 
-def test_a_fit_without_a_known_pattern_says_nothing_about_it() -> None:
+def test_a_fit_without_a_known_pattern_says_nothing_about_it():
     spoilt = observed(light(), 54)
     zeros = np.zeros((SIZE, SIZE))
     for systematics in (None, Systematics(zeros, zeros + 0.01, MIDDLE, RMS)):
@@ -255,7 +225,7 @@ def test_a_fit_without_a_known_pattern_says_nothing_about_it() -> None:
 
 
 @cache
-def rolls(pedestal: float = 0.0) -> list[Observation]:
+def rolls(pedestal=0.0):
     """Two rolls of the planet on the same pixels, with a pattern of 3 %."""
     error, frames = 0.5 * pattern(), []
     for k, angle in enumerate((0.0, 60.0)):
@@ -269,7 +239,7 @@ def rolls(pedestal: float = 0.0) -> list[Observation]:
     return frames
 
 
-def test_frames_of_the_same_pixels_share_what_is_unknown_of_the_pattern() -> None:
+def test_frames_of_the_same_pixels_share_what_is_unknown_of_the_pattern():
     zeros = np.zeros((SIZE, SIZE))
     unknown = Systematics(zeros, zeros + 0.5 * RMS, MIDDLE, RMS, first_pixel=(600, 1600))
     settings = GaussNewton(basis=BASIS, response_npix=NPIX)
@@ -306,7 +276,7 @@ def test_frames_of_the_same_pixels_share_what_is_unknown_of_the_pattern() -> Non
 
 
 @pytest.mark.slow
-def test_the_pattern_multiplies_the_pedestal(tmp_path: Path) -> None:
+def test_the_pattern_multiplies_the_pedestal(tmp_path):
     pedestal = 1e4
     measured = Systematics(
         0.5 * pattern(),
@@ -344,9 +314,7 @@ def test_the_pattern_multiplies_the_pedestal(tmp_path: Path) -> None:
     assert again.frames[1].values["pedestal"] == low.frames[1].values["pedestal"]
 
 
-def fit_of(
-    star: np.ndarray, error: np.ndarray, pedestal: float, seed: int, stated: float = 0.05
-) -> SimpleNamespace:
+def fit_of(star, error, pedestal, seed, stated=0.05):
     """Two frames of a star with a pattern on star and pedestal, and noise of 0.05."""
     rng = np.random.default_rng(seed)
     frames = []
@@ -368,12 +336,12 @@ def fit_of(
     return SimpleNamespace(frames=tuple(frames), status=Status.CONVERGED)
 
 
-def halo(size: int = 100) -> np.ndarray:
+def halo(size=100):
     y, x = np.indices((size, size)) - (size - 1) / 2
     return 30.0 / (1 + (np.hypot(x, y) / 8) ** 3)
 
 
-def test_the_pedestal_makes_the_pattern_equally_strong_everywhere() -> None:
+def test_the_pedestal_makes_the_pattern_equally_strong_everywhere():
     """Two frames of a bright star with a pattern of 3 % on star and pedestal."""
     size, pedestal, noise, star = 100, 1.5, 0.05, halo()
     error = 0.03 * np.random.default_rng(9).normal(size=(size, size))
@@ -392,7 +360,7 @@ def test_the_pedestal_makes_the_pattern_equally_strong_everywhere() -> None:
     assert pattern_pedestal([SimpleNamespace(**{**vars(fit), "frames": (frames[0], lost)})]) == 0
 
 
-def test_stars_of_different_brightness_tell_the_pedestal_wherever_the_pattern_is_weak() -> None:
+def test_stars_of_different_brightness_tell_the_pedestal_wherever_the_pattern_is_weak():
     """The pattern is half as strong near the star, as where the wavefront has taken a part."""
     star = halo()
     error = 0.03 * np.random.default_rng(3).normal(size=star.shape)
@@ -405,7 +373,7 @@ def test_stars_of_different_brightness_tell_the_pedestal_wherever_the_pattern_is
     assert pattern_pedestal(equal) > 2.5
 
 
-def test_a_pattern_is_not_shrunk_by_errors_that_are_too_large() -> None:
+def test_a_pattern_is_not_shrunk_by_errors_that_are_too_large():
     star = halo()
     error = 0.03 * np.random.default_rng(4).normal(size=star.shape)
     far = star < 1
@@ -415,16 +383,3 @@ def test_a_pattern_is_not_shrunk_by_errors_that_are_too_large() -> None:
         # The slope of the truth against the pattern is 1 if it is shrunk as it should be.
         slope = (error * pattern)[far].sum() / (pattern**2)[far].sum()
         assert slope == pytest.approx(1.0, abs=0.05)
-
-
-def test_a_given_start_wins_over_the_default_of_the_model() -> None:
-    usual = {"lyot_rotation": 0.5, "lyot_shift": (0.01, 0.0)}
-    system = dr.nircam_coronagraph(
-        "F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE, defaults=usual
-    )
-    start = {"lyot_rotation": 0.2}
-    problem = Problem(system, observed(light(), 1), as_opd_map(before()), start)
-    values = problem.optical_start(("lyot_rotation", "lyot_shift", "blur"))
-    assert values["lyot_rotation"].tolist() == [0.2]
-    assert values["lyot_shift"].tolist() == [0.01, 0.0]
-    assert values["blur"].tolist() == [0.026]

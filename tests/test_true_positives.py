@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 
 
 @cache
-def searched() -> dr.Detection:
+def searched():
     """A star alone, of which the model is exact."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
     opd = dr.random_opd(1, npix=128)
@@ -24,7 +23,7 @@ def searched() -> dr.Detection:
     return dr.detect(dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6)))
 
 
-def test_half_of_the_planets_at_the_limit_are_found() -> None:
+def test_half_of_the_planets_at_the_limit_are_found():
     """Noise is Gaussian: S/N of planets at the limit is 5 on average, and symmetric about it."""
     table = dr.completeness(
         searched(), separations=[0.5] * u.arcsec, strengths=[0.5, 1.0, 2.0], angles=20
@@ -44,7 +43,7 @@ def test_half_of_the_planets_at_the_limit_are_found() -> None:
 
 
 @pytest.mark.slow
-def test_planets_are_found_where_full_fits_find_them() -> None:
+def test_planets_are_found_where_full_fits_find_them():
     """A planet in the frames, everything fitted again: as in the maps to first order."""
     detection = searched()
     frames = detection.fits[0].frames
@@ -63,7 +62,7 @@ def test_planets_are_found_where_full_fits_find_them() -> None:
         assert (found > 2) == expected
 
 
-def test_the_contrast_of_a_fraction_is_interpolated() -> None:
+def test_the_contrast_of_a_fraction_is_interpolated():
     table = QTable(
         {
             "separation": np.repeat([0.4, 0.8], 3) * u.arcsec,
@@ -79,7 +78,7 @@ def test_the_contrast_of_a_fraction_is_interpolated() -> None:
     assert np.isnan(contrast_of_completeness(table, 0.95)["contrast"]).all()
 
 
-def test_without_fits_there_is_no_completeness(tmp_path: Path) -> None:
+def test_without_fits_there_is_no_completeness(tmp_path):
     path = next(each for each in searched().write(tmp_path) if each.suffix == ".fits")
     with pytest.raises(IncompatibleSetupError, match="without its fits"):
         dr.completeness(dr.Detection.read(path))

@@ -201,14 +201,14 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "unaligned", "shifts of aligned frames are undone, not doubled",
-            'undo_shifts(data[part], error[part], (pixels - net)[part])',
-            'undo_shifts(data[part], error[part], (net - pixels)[part])',
+            "error[part].astype(float), (pixels - net)[part]",
+            "error[part].astype(float), (net - pixels)[part]",
             "detector_pixels",
         ),
         Breakage(
             "combined", "frames are averaged with inverse variances",
-            "weight = valid / np.reshape(typical, (-1, 1, 1))",
-            "weight = valid * np.reshape(typical, (-1, 1, 1))", "observation noise",
+            "weight = 1 / np.median(variance[usable])", "weight = np.median(variance[usable])",
+            "observation noise",
         ),
         Breakage(
             "other-mask", "of several set-ups that of most frames is kept",
@@ -230,13 +230,12 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "checksum", "files whose data changed are refused",
-            "if hdu.verify_datasum() == 0:", "if hdu.verify_datasum() is None:",
+            "if stated and stated != str(of_data):", "if stated and not of_data:",
             "hard/hard_files files_units",
         ),
         Breakage(
             "masked", "masked values do not enter as numbers",
-            "np.ma.filled(value.astype(np.float64), np.nan)",
-            "np.ma.filled(value.astype(np.float64), 0.0)", "files_units quantities",
+            "values[mask] = np.nan", "values[mask] = 0.0", "files_units containers",
         ),
     ]  # fmt: skip
 
@@ -308,7 +307,7 @@ def _detection() -> list[Breakage]:
         Breakage(
             "inner", "no candidate is inside the smallest separation",
             "if separation_of(more.offsets.numpy())[-1] < self.inner:",
-            "if len(more) > 10:", "detection search",
+            "if len(more) > 10:", "detection",
         ),
         Breakage(
             "inflation", "errors grow with the square root of chi-squared",
@@ -341,7 +340,7 @@ def _around() -> list[Breakage]:
         ),
         Breakage(
             "pointings", "only frames of one orientation are averaged",
-            "                and abs(half_circle(angle - angles[other])) <= _SAME_ANGLE\n", "",
+            "(apart <= _SAME_PLACE) & (turned <= _SAME_ANGLE)", "(apart <= _SAME_PLACE)",
             "backend backend_refine",
         ),
         Breakage(
@@ -361,7 +360,7 @@ def _around() -> list[Breakage]:
         ),
         Breakage(
             "half-a-job", "a job without all of its products is not finished",
-            'whole = sizes == record["products"] and', 'whole = bool(sizes) and', "survey",
+            'whole = sizes == record["products"]', 'whole = bool(sizes)', "survey",
         ),
     ]  # fmt: skip
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import warnings
-from collections.abc import Callable
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
@@ -20,19 +18,16 @@ __all__ = ["READERS", "calints", "content", "opd_map", "outcome", "same", "sane"
 
 Result = OPDMap | Observation
 
-READERS: dict[str, Callable[[Path], Result]] = {
-    "opd": read_opd,
-    "calints": Observation.from_fits,
-}
+READERS = {"opd": read_opd, "calints": Observation.from_fits}
 
 
 @lru_cache(maxsize=1)
-def wavefront() -> np.ndarray:
+def wavefront():
     """16 x 16 samples, m."""
     return random_opd(5, npix=16).data
 
 
-def opd_map(data: np.ndarray | None = None) -> fits.HDUList:
+def opd_map(data=None):
     """A wavefront map."""
     hdu = fits.PrimaryHDU(wavefront() if data is None else data)
     hdu.header["BUNIT"] = "m"
@@ -40,7 +35,7 @@ def opd_map(data: np.ndarray | None = None) -> fits.HDUList:
     return fits.HDUList([hdu])
 
 
-def calints(**planes: np.ndarray) -> fits.HDUList:
+def calints(**planes):
     """Two frames of 8 x 10; SCI, ERR or DQ may be given."""
     rng = np.random.default_rng(1)
     data = rng.normal(10, 2, (2, 8, 10)).astype(np.float32)
@@ -61,18 +56,18 @@ def calints(**planes: np.ndarray) -> fits.HDUList:
     return hdus
 
 
-_MAKERS: dict[str, Callable[[], fits.HDUList]] = {"opd": opd_map, "calints": calints}
+_MAKERS = {"opd": opd_map, "calints": calints}
 
 
 @lru_cache(maxsize=16)
-def content(kind: str, checksum: bool = False, packed: bool = False) -> bytes:
+def content(kind, checksum=False, packed=False):
     """The bytes of a whole file."""
     stream = io.BytesIO()
     _MAKERS[kind]().writeto(stream, checksum=checksum)
     return gzip.compress(stream.getvalue(), mtime=0) if packed else stream.getvalue()
 
 
-def outcome(kind: str, path: Path, damaged: bytes) -> tuple[Result | None, bool]:
+def outcome(kind, path, damaged):
     """Read a damaged file: (result, whether there was a warning), or (None, True) for an error.
 
     Errors that are not the package's own go through.
@@ -90,19 +85,19 @@ def outcome(kind: str, path: Path, damaged: bytes) -> tuple[Result | None, bool]
             return None, True
 
 
-def _arrays(result: Result) -> list[np.ndarray]:
+def _arrays(result):
     if isinstance(result, OPDMap):
         return [result.data]
     return [result.data, result.error, result.valid, result.center, np.array(result.pixelscale)]
 
 
-def same(result: Result, truth: Result) -> bool:
+def same(result, truth):
     """Whether two results are the same in all numbers."""
     pairs = zip(_arrays(result), _arrays(truth), strict=True)
     return all(np.array_equal(a, b) for a, b in pairs) and result.date == truth.date
 
 
-def sane(result: Result) -> bool:
+def sane(result):
     """Whether a result is one that everything behind the reader can take."""
     finite = all(np.isfinite(a).all() for a in _arrays(result))
     if isinstance(result, OPDMap):

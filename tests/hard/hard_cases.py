@@ -12,7 +12,6 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.optics import Bandpass, OpticalSystem, PupilGrid
@@ -50,14 +49,14 @@ class Row:
     measure: Callable[[torch.dtype], float]
 
 
-def small(**changes: object) -> OpticalSystem:
+def small(**changes):
     """The coronagraph on a small grid."""
     settings = {"monochromatic": WAVELENGTH, "npix": NPIX, "fov_pixels": 32, **changes}
-    return nircam_coronagraph("F444W", **settings)  # type: ignore[arg-type]
+    return nircam_coronagraph("F444W", **settings)
 
 
 @lru_cache(maxsize=8)
-def system(dtype: torch.dtype, wavelength: float = WAVELENGTH) -> OpticalSystem:
+def system(dtype, wavelength=WAVELENGTH):
     """The same, made once; at any wavelength, also those that no filter has."""
     model = small(dtype=dtype)
     if wavelength == WAVELENGTH:
@@ -67,33 +66,33 @@ def system(dtype: torch.dtype, wavelength: float = WAVELENGTH) -> OpticalSystem:
 
 
 @lru_cache(maxsize=8)
-def wavefront(seed: int = 5, rms: float = 66e-9) -> torch.Tensor:
+def wavefront(seed=5, rms=66e-9):
     """A wavefront as in flight, m."""
     return torch.from_numpy(random_opd(seed, npix=NPIX, rms=rms).data)
 
 
 @lru_cache(maxsize=2)
-def segment(npix: int = NPIX) -> torch.Tensor:
+def segment(npix=NPIX):
     """1 on one segment, 0 elsewhere."""
     return (SegmentMotions().modes(PupilGrid.full(npix), 6, 7)[0] > 0.5).double()
 
 
-def array(image: torch.Tensor | NDArray[np.floating]) -> NDArray[np.float64]:
+def array(image):
     """Any image as a float64 array."""
     if isinstance(image, torch.Tensor):
         image = image.detach().numpy()
     return np.asarray(image, dtype=np.float64)
 
 
-def worst(image: object, truth: object) -> float:
+def worst(image, truth):
     """Largest difference of two images as a fraction of the peak; NaN counts as infinite."""
-    got, true = array(image), array(truth)  # type: ignore[arg-type]
+    got, true = array(image), array(truth)
     difference = np.abs(got - true).max() / np.abs(true).max()
     return float(difference) if np.isfinite(difference) else float("inf")
 
 
-def distance(vector: object, truth: object) -> float:
+def distance(vector, truth):
     """Length of a difference as a fraction of the length of the truth."""
-    got, true = array(vector), array(truth)  # type: ignore[arg-type]
+    got, true = array(vector), array(truth)
     difference = np.linalg.norm(got - true) / np.linalg.norm(true)
     return float(difference) if np.isfinite(difference) else float("inf")

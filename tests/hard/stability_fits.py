@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from hard_cases import WAVELENGTH, segment
 from numpy.typing import NDArray
 
 from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.optics import OpticalSystem, PupilGrid
+from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront import (
@@ -48,41 +47,41 @@ parameters that it determines take up about 40 of 576 pixels, an error of 0.26 s
 
 
 @lru_cache(maxsize=2)
-def model(dtype: torch.dtype = torch.float64) -> OpticalSystem:
+def model(dtype=torch.float64):
     """24 x 24 pixels."""
     return nircam_coronagraph(monochromatic=WAVELENGTH, npix=NPIX, fov_pixels=SIZE, dtype=dtype)
 
 
 @lru_cache(maxsize=1)
-def old() -> Array:
+def old():
     """The wavefront that fits start from, m."""
     return random_opd(3, npix=NPIX).data
 
 
 @lru_cache(maxsize=1)
-def _now() -> Array:
+def _now():
     size = 4e-9 / (1 + FEW.frequencies)
     change = size * torch.randn(len(FEW), generator=torch.Generator().manual_seed(1))
     return old() + FEW.opd(change.double(), PupilGrid.full(NPIX)).numpy()
 
 
-def drift_rms() -> float:
+def drift_rms():
     """How far the wavefront has moved, rms over the pupil, m."""
     return float((_now() - old())[model().entrance.lit.numpy()].std())
 
 
-def star(opd: Array | None = None) -> Array:
+def star(opd=None):
     """The true star, photons."""
     with torch.no_grad():
         return FLUX * model()(_now() if opd is None else opd, OFFSET).numpy()
 
 
-def noise(truth: Array | None = None) -> Array:
+def noise(truth=None):
     """Standard deviation of every pixel."""
     return np.sqrt((star() if truth is None else truth) + BACKGROUND + READ_NOISE**2)
 
 
-def planet(*planets: Planet) -> Array:
+def planet(*planets):
     """Their light, photons."""
     with torch.no_grad():
         images = [
@@ -92,7 +91,7 @@ def planet(*planets: Planet) -> Array:
     return sum(images, np.zeros((SIZE, SIZE)))
 
 
-def observed(truth: Array, seed: int = 2) -> Observation:
+def observed(truth, seed=2):
     """A frame of it, with noise."""
     rng = np.random.default_rng(seed)
     counts = rng.poisson(truth + BACKGROUND) + rng.normal(0, READ_NOISE, truth.shape)
@@ -100,15 +99,13 @@ def observed(truth: Array, seed: int = 2) -> Observation:
     return Observation.from_arrays(counts, error, pixelscale=0.062424185, name="hard case")
 
 
-def error_of(image: Array, truth: Array | None = None) -> float:
+def error_of(image, truth=None):
     """Rms error of a star with its background, in sigma."""
     truth = star() if truth is None else truth
     return float(np.sqrt(np.mean(((image - BACKGROUND - truth) / noise(truth)) ** 2)))
 
 
-def fitted(
-    frame: Observation, opd: Array | None = None, dtype: torch.dtype = torch.float64, **options: Any
-) -> Refinement:
+def fitted(frame, opd=None, dtype=torch.float64, **options):
     """The fit, from the old wavefront unless another is given."""
     start = options.pop("start", None)
     settings = GaussNewton(**{"basis": FEW, "response_npix": NPIX, **options})
@@ -143,12 +140,11 @@ PRIOR = 4.0
 """nm, of every segment motion."""
 
 
-def piston_of_segments() -> Pistons:
+def piston_of_segments():
     """18 pistons are free; what they have in common is invisible."""
     prior = WavefrontPrior({"segment": PRIOR, "texture": 3.0}, fit_scales=False)
     fit = fitted(observed(star()), basis=MORE, prior=prior)
     found = fit.frames[0].coefficients
-    assert found is not None
     covariance = fit.linear.covariance.numpy()[-len(MORE) :, -len(MORE) :]
     mean = np.zeros(len(MORE))
     mean[:54:3] = 18**-0.5
@@ -161,13 +157,13 @@ def piston_of_segments() -> Pistons:
 # -- what is done to the frame -----------------------------------------------------------------
 
 
-def _missing(share: float) -> Observation:
+def _missing(share):
     frame = observed(star())
     valid = np.random.default_rng(9).random(frame.data.shape) >= share
     return replace(frame, valid=valid)
 
 
-def _saturated(flagged: bool) -> Observation:
+def _saturated(flagged):
     """The brightest 3 % of the pixels are full."""
     frame = observed(star())
     full = float(np.quantile(frame.data, 0.97))
@@ -176,7 +172,7 @@ def _saturated(flagged: bool) -> Observation:
     )
 
 
-def _hit(flagged: bool, sigma: float = 1000.0, count: int = 10) -> Observation:
+def _hit(flagged, sigma=1000.0, count=10):
     """Hot pixels, or cosmic rays, at 1000 sigma."""
     frame = observed(star())
     where = np.random.default_rng(8).choice(frame.data.size, count, replace=False)
@@ -186,7 +182,7 @@ def _hit(flagged: bool, sigma: float = 1000.0, count: int = 10) -> Observation:
     return replace(frame, data=data, valid=valid)
 
 
-def _wave(waves: float) -> Array:
+def _wave(waves):
     return _now() + waves * WAVELENGTH * segment(NPIX).numpy()
 
 
@@ -213,18 +209,8 @@ class FitRow:
     limit: float = SUCCESS
 
 
-def _row(
-    case: str,
-    trouble: str,
-    sees: str,
-    make: Callable[[], Observation],
-    *ends: Status,
-    limit: float = SUCCESS,
-    truth: Callable[[], Array] = star,
-    start: Callable[[], Array] = old,
-    **options: Any,
-) -> FitRow:
-    def run(dtype: torch.dtype) -> tuple[Refinement, float]:
+def _row(case, trouble, sees, make, *ends, limit=SUCCESS, truth=star, start=old, **options):
+    def run(dtype):
         fit = fitted(make(), start(), dtype, **options)
         return fit, error_of(fit.frames[0].star, truth())
 

@@ -24,12 +24,7 @@ from hard_cases import (
     worst,
 )
 
-from pyklip_diffrender.instrument import (
-    MASKS,
-    NIRCAM_LW_PIXELSCALE,
-    jwst_pupil,
-    maskrnd_openings,
-)
+from pyklip_diffrender.instrument import MASKS, NIRCAM_LW_PIXELSCALE, jwst_pupil, maskrnd_openings
 from pyklip_diffrender.optics import PupilGrid, polygon_coverage
 from pyklip_diffrender.scene import Planet, Scene, expected_photons, planet_photons, star_photons
 
@@ -43,7 +38,7 @@ FLUX, READ_NOISE = 2.8e12, 42.0
 
 
 @lru_cache(maxsize=8)
-def _plain_fft(mas: float) -> np.ndarray:
+def _plain_fft(mas):
     """The image by poppy's FFTs; the offset lies on no axis and no diagonal."""
     planes = reference.coronagraph(
         jwst_pupil(NPIX).numpy(),
@@ -57,11 +52,11 @@ def _plain_fft(mas: float) -> np.ndarray:
     return reference.image(planes, WAVELENGTH, *_offset(mas))
 
 
-def _offset(mas: float) -> tuple[float, float]:
+def _offset(mas):
     return mas * 1e-3 * math.cos(0.7), mas * 1e-3 * math.sin(0.7)
 
 
-def plain_fft(mas: float, route: str, sampling: float | None, dtype: torch.dtype) -> float:
+def plain_fft(mas, route, sampling, dtype):
     """Semi-analytic image against the plain FFT with 4 samples per lambda/D on the occulter."""
     model = small(
         si_wfe=reference.tabulated(reference.lopsided_zernikes(), WAVELENGTH), flip_si_wfe=True,
@@ -70,13 +65,13 @@ def plain_fft(mas: float, route: str, sampling: float | None, dtype: torch.dtype
     return worst(model(reference.lopsided_opd(NPIX), _offset(mas)), _plain_fft(mas))
 
 
-def sampling(dtype: torch.dtype) -> float:
+def sampling(dtype):
     """The default route against 16 cells per lambda/D, plane by plane."""
     fine = small(occulter_sampling=16.0, route="planes")(wavefront())
     return worst(system(dtype)(wavefront()), fine)
 
 
-def occulter(dtype: torch.dtype) -> float:
+def occulter(dtype):
     """1 - t at radii from 1e-12 arcsec to the edge, against 50 digits."""
     radii = np.concatenate([[0.0], np.geomspace(1e-12, 1.0, 40)])
     with mpmath.workdps(50):
@@ -88,7 +83,7 @@ def occulter(dtype: torch.dtype) -> float:
     return float(np.abs(array(got) / exact - 1).max())
 
 
-def hit(microns: float, waves: float, dtype: torch.dtype) -> float:
+def hit(microns, waves, dtype):
     """A segment `waves` too high against one a whole wave lower: the same image."""
     wavelength = microns * 1e-6
     model, opd = system(dtype, wavelength), wavefront()
@@ -96,15 +91,15 @@ def hit(microns: float, waves: float, dtype: torch.dtype) -> float:
     return worst(model(opd + waves * wavelength * segment()), low)
 
 
-def _gradient(model: object, opd: torch.Tensor) -> torch.Tensor:
+def _gradient(model, opd):
     weight = torch.rand(32, 32, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     variable = opd.clone().requires_grad_()
-    (model(variable) * weight).sum().backward()  # type: ignore[operator]
+    (model(variable) * weight).sum().backward()
     assert variable.grad is not None
     return variable.grad
 
 
-def hit_gradient(waves: float, dtype: torch.dtype) -> float:
+def hit_gradient(waves, dtype):
     """The same for the gradient of a sum of pixels."""
     model, opd = system(dtype), wavefront()
     return distance(
@@ -113,27 +108,27 @@ def hit_gradient(waves: float, dtype: torch.dtype) -> float:
     )
 
 
-def piston(dtype: torch.dtype) -> float:
+def piston(dtype):
     """1 um of piston over the whole pupil."""
     exact = system(torch.float64)(wavefront())
     return worst(system(dtype)(wavefront() + 1e-6), exact)
 
 
-def piston_gradient(dtype: torch.dtype) -> float:
+def piston_gradient(dtype):
     """Share of the gradient along piston."""
     gradient = _gradient(system(dtype), wavefront())
     lit = system(dtype).entrance.lit
     return abs(float(gradient.sum())) / (float(gradient.norm()) * math.sqrt(float(lit.sum())))
 
 
-def units(dtype: torch.dtype) -> float:
+def units(dtype):
     """The wavefront in m, um and nm."""
     model, opd = system(dtype), wavefront().numpy()
     truth = system(torch.float64)(wavefront())
     return max(worst(model(q), truth) for q in (opd * u.m, opd * 1e6 * u.um, opd * 1e9 * u.nm))
 
 
-def threads(dtype: torch.dtype) -> float:
+def threads(dtype):
     """Eight threads against one."""
     before = torch.get_num_threads()
     images = []
@@ -147,7 +142,7 @@ def threads(dtype: torch.dtype) -> float:
 # -- planets and gradients near the truth ------------------------------------------------------
 
 
-def faint_planet(separation: float, dtype: torch.dtype) -> float:
+def faint_planet(separation, dtype):
     """A planet of contrast 1e-10 in the scene, less the star, against the planet alone."""
     planet = Planet(1e-10, separation, 40.0)
     scene = Scene(planets=(planet,))
@@ -156,7 +151,7 @@ def faint_planet(separation: float, dtype: torch.dtype) -> float:
     return worst(got, planet_photons(system(torch.float64), scene, planet, opd))
 
 
-def summed_in_float32(separation: float) -> float:
+def summed_in_float32(separation):
     """The error of that planet if star and planet were added up in float32."""
     model, opd = system(torch.float32), wavefront()
     star = model(opd)
@@ -164,13 +159,13 @@ def summed_in_float32(separation: float) -> float:
     return worst((star + planet) - star, planet)
 
 
-def _chi2(dtype: torch.dtype, opd: torch.Tensor) -> torch.Tensor:
+def _chi2(dtype, opd):
     truth = system(torch.float64)(wavefront()).detach()
     sigma = torch.sqrt(FLUX * truth + READ_NOISE**2)
     return (((FLUX * system(dtype)(opd).double() - FLUX * truth) / sigma) ** 2).mean()
 
 
-def chi2_gradient(nanometres: float, dtype: torch.dtype) -> float:
+def chi2_gradient(nanometres, dtype):
     """Gradient of chi2 with the wavefront so far from the truth.
 
     float64 against a finite difference along the line to the truth, float32 against float64.
@@ -191,7 +186,7 @@ def chi2_gradient(nanometres: float, dtype: torch.dtype) -> float:
     return abs(float((gradients[0] * away).sum()) / numeric - 1)
 
 
-def _rows() -> list[Row]:
+def _rows():
     rows = [
         Row(
             f"star {mas:g} mas off, against a plain FFT" if mas else "star exactly on the axis",

@@ -10,15 +10,11 @@ import pytest
 import torch
 from hard_cases import DTYPES
 from stability_fits import (
-    BACKGROUND,
     FITS,
     FLUX,
     NPIX,
     OFFSET,
     PRIOR,
-    SUCCESS,
-    FitRow,
-    error_of,
     fitted,
     model,
     noise,
@@ -28,23 +24,13 @@ from stability_fits import (
     star,
 )
 
-from pyklip_diffrender.detection.metrics import psnr, star_model_error, throughput
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
-from pyklip_diffrender.refinement import Refinement, Status
+from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.wavefront import FourierModes
 
 pytestmark = pytest.mark.hard
 
-SPOILT = {
-    "zeros": lambda a: 0 * a,
-    "transposed": lambda a: a.T,
-    "1 % brighter": lambda a: 1.01 * a,
-}
-
-
-ELSEWHERE = ("the start upside down", "the start transposed")
-"""The first in test_refinement.py, on a larger case; both in `benchmarks.stability`."""
 
 STEPS = {
     "star_offset": 1e-5, "lyot_shift": 1e-5, "lyot_rotation": 1e-3, "si_zernikes": 1e-11,
@@ -57,7 +43,7 @@ QUICK = ("saturated core, flagged", "bright planet, 1e-3")
 
 
 @lru_cache(maxsize=32)
-def result(row: FitRow, dtype: torch.dtype) -> tuple[Refinement, float]:
+def result(row, dtype):
     """Each fit once."""
     return row.run(dtype)
 
@@ -67,10 +53,10 @@ def result(row: FitRow, dtype: torch.dtype) -> tuple[Refinement, float]:
     [
         pytest.param(row, id=row.case, marks=() if row.case in QUICK else pytest.mark.slow)
         for row in FITS
-        if row.case not in ELSEWHERE
+        if row.case != "the start transposed"  # In `benchmarks.stability`.
     ],
 )
-def test_a_fit_ends_as_the_table_says(row: FitRow) -> None:
+def test_a_fit_ends_as_the_table_says(row):
     fit, error = result(row, torch.float64)
     assert fit.status in row.ends
     # Of the fitted star: right where the fit says that it is, and a number everywhere.
@@ -87,7 +73,7 @@ def test_a_fit_ends_as_the_table_says(row: FitRow) -> None:
     "case",
     ["nothing hard", "50 % missing", "saturated core, flagged", "the same with max_companions=1"],
 )
-def test_a_float32_model_fits_as_well(case: str) -> None:
+def test_a_float32_model_fits_as_well(case):
     """The optics in float32, the algebra in float64."""
     row = next(row for row in FITS if row.case == case)
     single, error = result(row, torch.float32)
@@ -99,27 +85,8 @@ def test_a_float32_model_fits_as_well(case: str) -> None:
     assert np.abs((single.frames[0].star - double.frames[0].star) / noise()).max() < 0.05
 
 
-@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
-def test_a_spoilt_star_is_no_success(spoil: object) -> None:
-    """What the fits are held to, and the metrics of the reports, notice all of them."""
-    wrong = spoil(star())  # type: ignore[operator]
-    assert error_of(star() + BACKGROUND) < 1e-9
-    assert error_of(wrong + BACKGROUND) > 3 * SUCCESS
-    assert max(row.limit for row in FITS if row.ends == (Status.CONVERGED,)) < 3 * SUCCESS
-    middle = (11.5, 11.5)
-    assert star_model_error(wrong, star(), noise(), middle, 2, 10) > 3 * SUCCESS
-    assert star_model_error(star(), star(), noise(), middle, 2, 10) == 0
-    assert psnr(wrong, star(), middle) < 60 < psnr(star(), star(), middle)
-    kept = throughput(wrong, star(), noise(), (5.0, 8.0))
-    assert abs(kept - 1) > 0.009
-    assert throughput(star(), star(), noise(), (5.0, 8.0)) == pytest.approx(1, rel=1e-12)
-
-
-# -- what no image shows ------------------------------------------------------------------------
-
-
 @pytest.mark.slow
-def test_piston_of_all_segments_does_not_drift_and_is_reported_as_unknown() -> None:
+def test_piston_of_all_segments_does_not_drift_and_is_reported_as_unknown():
     found = piston_of_segments()
     assert found.fit.status is Status.CONVERGED
     assert abs(found.together) < 0.2 * PRIOR
@@ -129,10 +96,7 @@ def test_piston_of_all_segments_does_not_drift_and_is_reported_as_unknown() -> N
     assert found.errors.min() < 0.5 * PRIOR
 
 
-# -- derivatives -------------------------------------------------------------------------------
-
-
-def test_the_jacobian_of_a_fit_matches_finite_differences_in_every_column() -> None:
+def test_the_jacobian_of_a_fit_matches_finite_differences_in_every_column():
     """All that a fit may leave free, flux and background and modes too."""
     names = (*(p.name for p in OPTICAL_PARAMETERS), "flux", "background")
     basis = FourierModes(1)
@@ -144,7 +108,7 @@ def test_the_jacobian_of_a_fit_matches_finite_differences_in_every_column() -> N
     sizes = {name: parameter(name).size for name in names} | {"modes": len(basis)}
     assert len(at) == len(frame.jacobian) == sum(sizes.values())
 
-    def image(values: dict[str, float]) -> np.ndarray:
+    def image(values):
         """The star, without the package's own linearisation."""
         vectors = {
             name: torch.tensor([values[f"{name}[{k}]"] for k in range(size)], dtype=torch.float64)
@@ -170,14 +134,9 @@ def test_the_jacobian_of_a_fit_matches_finite_differences_in_every_column() -> N
         assert np.abs(slope).max() > 20 * rounding or label == "si_zernikes[0]", label
 
 
-# -- masked pixels -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
-@pytest.mark.parametrize("junk", [1e30, -1e300])
-def test_masked_pixels_of_a_finished_observation_change_nothing_bitwise(
-    junk: float, dtype: torch.dtype
-) -> None:
+@pytest.mark.parametrize("junk", [1e30, -1e300, np.nan])
+def test_masked_pixels_of_a_finished_observation_change_nothing_bitwise(junk, dtype):
     """Masked after the observation was made, so that what is there is still there."""
     frame = observed(star())
     valid = np.random.default_rng(4).random(frame.data.shape) > 0.05
@@ -190,11 +149,3 @@ def test_masked_pixels_of_a_finished_observation_change_nothing_bitwise(
     assert dirty.frames[0].star.tobytes() == clean.frames[0].star.tobytes()
     assert dirty.chi2_per_pixel == clean.chi2_per_pixel
     assert np.isfinite(dirty.frames[0].star).all()
-
-
-def test_masked_nan_of_a_finished_observation_change_nothing() -> None:
-    frame = observed(star())
-    valid = np.random.default_rng(4).random(frame.data.shape) > 0.05
-    spoilt = replace(frame, data=np.where(valid, frame.data, np.nan), valid=valid)
-    clean = fitted(replace(frame, valid=valid), max_iterations=3)
-    assert fitted(spoilt, max_iterations=3).wavefront.tobytes() == clean.wavefront.tobytes()

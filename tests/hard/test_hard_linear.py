@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -16,14 +15,7 @@ from pyklip_diffrender.bridges.image_masks import (
     SeparablePart,
 )
 from pyklip_diffrender.io import ARCSEC
-from pyklip_diffrender.optics import (
-    JWST_DIAMETER,
-    MatrixFourier,
-    OpticalSystem,
-    Plane,
-    PupilGrid,
-    Wavefront,
-)
+from pyklip_diffrender.optics import JWST_DIAMETER, MatrixFourier, PupilGrid, Wavefront
 
 pytestmark = pytest.mark.hard
 
@@ -33,22 +25,18 @@ ONTO = PupilGrid(N, JWST_DIAMETER, (6, 40), (8, 45))
 LIMITS = {torch.float64: 1e-10, torch.float32: 1e-4}
 """float32 holds 6e-8 a product; thousands are added up, with signs."""
 
-Stage = Callable[[torch.Tensor], torch.Tensor]
 
-
-def model(dtype: torch.dtype) -> OpticalSystem:
+def model(dtype):
     return small(npix=N, fov_pixels=(10, 13), oversample=2, dtype=dtype)
 
 
-def of_plane(
-    plane_of: Callable[[torch.dtype], Plane],
-) -> Callable[[torch.dtype], tuple[Stage, tuple[int, ...]]]:
+def of_plane(plane_of):
     """A plane between two windows. Planes keep transforms of one type: a new one for each."""
 
-    def make(dtype: torch.dtype) -> tuple[Stage, tuple[int, ...]]:
+    def make(dtype):
         plane = plane_of(dtype)
 
-        def stage(field: torch.Tensor) -> torch.Tensor:
+        def stage(field):
             return plane.apply(Wavefront(field, WAVELENGTH, GRID), {}, ONTO).field
 
         return stage, GRID.shape
@@ -56,8 +44,8 @@ def of_plane(
     return make
 
 
-def onto_detector(shear: float, shift: bool) -> Callable[..., tuple[Stage, tuple[int, ...]]]:
-    def make(dtype: torch.dtype) -> tuple[Stage, tuple[int, ...]]:
+def onto_detector(shear, shift):
+    def make(dtype):
         detector = replace(model(dtype).detector, shear=shear)
         values = {"detector_shift": torch.tensor([0.01, 0.02])} if shift else {}
         return (
@@ -68,24 +56,24 @@ def onto_detector(shear: float, shift: bool) -> Callable[..., tuple[Stage, tuple
     return make
 
 
-def pixels(dtype: torch.dtype) -> tuple[Stage, tuple[int, ...]]:
+def pixels(dtype):
     """Blur and binning; real."""
     detector = model(dtype).detector
     values = {"blur": torch.tensor([0.05], dtype=torch.float64)}
     return lambda light: detector.image(light, values), (20, 26)
 
 
-def whole(dtype: torch.dtype) -> tuple[Stage, tuple[int, ...]]:
+def whole(dtype):
     system = model(dtype)
     grid = system.entrance.grid
     return lambda field: system.propagate(Wavefront(field, WAVELENGTH, grid), {}), grid.shape
 
 
-def gaussian(x: torch.Tensor, y: torch.Tensor, wavelength: float) -> torch.Tensor:
+def gaussian(x, y, wavelength):
     return torch.exp(-(x**2) / 0.02 - (y - 0.1) ** 2 / 0.05)
 
 
-def bar(x: torch.Tensor) -> torch.Tensor:
+def bar(x):
     return torch.exp(-((x - 0.1) ** 2) / 0.02)
 
 
@@ -117,12 +105,12 @@ STAGES = {
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
 @pytest.mark.parametrize("name", STAGES)
-def test_a_stage_and_its_derivative_are_adjoint(name: str, dtype: torch.dtype) -> None:
+def test_a_stage_and_its_derivative_are_adjoint(name, dtype):
     stage, shape = STAGES[name](dtype)
     generator = torch.Generator().manual_seed(2)
     kind = dtype if name == "blur and binning" else dtype.to_complex()
 
-    def noise(*shape: int) -> torch.Tensor:
+    def noise(*shape):
         return torch.randn(*shape, dtype=kind, generator=generator)
 
     before = noise(*shape).requires_grad_()
@@ -142,7 +130,7 @@ def test_a_stage_and_its_derivative_are_adjoint(name: str, dtype: torch.dtype) -
 
 
 @pytest.mark.parametrize("name", ["sampled mask", "bar", "padded FFT"])
-def test_a_mask_that_has_seen_single_precision_is_as_good_in_double(name: str) -> None:
+def test_a_mask_that_has_seen_single_precision_is_as_good_in_double(name):
     used, shape = STAGES[name](torch.float64)
     fresh, _ = STAGES[name](torch.float64)
     field = torch.randn(shape, dtype=torch.complex128, generator=torch.Generator().manual_seed(2))
@@ -153,9 +141,7 @@ def test_a_mask_that_has_seen_single_precision_is_as_good_in_double(name: str) -
 @pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
 @pytest.mark.parametrize(("rows", "columns"), [(8, 9), (9, 8), (1, 5), (2, 1)])
 @pytest.mark.parametrize("window", [(0, N), (3, 44)], ids=["symmetric", "window"])
-def test_transform_and_inverse_are_adjoint(
-    rows: int, columns: int, window: tuple[int, int], dtype: torch.dtype
-) -> None:
+def test_transform_and_inverse_are_adjoint(rows, columns, window, dtype):
     """The inverse is written by hand."""
     grid = PupilGrid(N, JWST_DIAMETER, window, window)
     x, y = (
@@ -164,7 +150,7 @@ def test_transform_and_inverse_are_adjoint(
     )
     generator = torch.Generator().manual_seed(5)
 
-    def noise(*shape: int) -> torch.Tensor:
+    def noise(*shape):
         return torch.randn(*shape, dtype=dtype.to_complex(), generator=generator)
 
     pupil, image = noise(*grid.shape), noise(rows, columns)

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from astropy.io import fits
-from hard_cases import NPIX, small, system, wavefront, worst
+from hard_cases import small, system, wavefront, worst
 from stability_fits import error_of, fitted, noise, observed, star
 
-from pyklip_diffrender.bridges.image_masks import FourierMask
 from pyklip_diffrender.io import open_fits, write_fits
-from pyklip_diffrender.optics import JWST_DIAMETER, Cache, Position, PupilGrid, Wavefront
 from pyklip_diffrender.scene import Planet, Scene, simulate
 from pyklip_diffrender.wavefront import random_drift, random_opd
 
@@ -31,14 +26,14 @@ PRECISIONS = pytest.mark.parametrize(
 
 
 @pytest.fixture
-def eight_threads() -> Iterator[None]:
+def eight_threads():
     before = torch.get_num_threads()
     torch.set_num_threads(8)
     yield
     torch.set_num_threads(before)
 
 
-def everything(seed: int) -> list[bytes]:
+def everything(seed):
     """Bits of all that draws random numbers."""
     scene = Scene(planets=(Planet(1e-4, 0.6, 30.0),))
     made = simulate(system(torch.float64), scene, wavefront().numpy(), seed=seed, frames=2)
@@ -46,7 +41,7 @@ def everything(seed: int) -> list[bytes]:
     return [array.tobytes() for array in arrays]
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_does_not() -> None:
+def test_the_same_seed_gives_the_same_bits_and_another_does_not():
     first, again, other = everything(7), everything(7), everything(8)
     assert first == again
     assert all(a != b for a, b in zip(first, other, strict=True))
@@ -54,13 +49,13 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not() -> None:
 
 @pytest.mark.usefixtures("eight_threads")
 @PRECISIONS
-def test_eight_threads_give_the_same_bits_every_time(dtype: torch.dtype) -> None:
+def test_eight_threads_give_the_same_bits_every_time(dtype):
     images = [small(dtype=dtype)(wavefront()).numpy() for _ in range(3)]
     assert images[0].tobytes() == images[1].tobytes() == images[2].tobytes()
 
 
 @pytest.mark.slow
-def test_a_fit_with_eight_threads_is_the_serial_fit() -> None:
+def test_a_fit_with_eight_threads_is_the_serial_fit():
     """Bits differ, sums are taken in another order; a thousandth of the noise is allowed."""
     before = torch.get_num_threads()
     fits_ = []
@@ -77,7 +72,7 @@ def test_a_fit_with_eight_threads_is_the_serial_fit() -> None:
 
 
 @PRECISIONS
-def test_eight_callers_of_one_model_get_what_one_gets(dtype: torch.dtype) -> None:
+def test_eight_callers_of_one_model_get_what_one_gets(dtype):
     """A fresh model: its constants are built by whoever comes first."""
     serial, shared = (
         small(dtype=dtype, monochromatic=None, nlambda=2, npix=64, fov_pixels=16) for _ in range(2)
@@ -92,42 +87,8 @@ def test_eight_callers_of_one_model_get_what_one_gets(dtype: torch.dtype) -> Non
     assert worst(expected[1], expected[0]) > 0.1
 
 
-def test_two_callers_of_a_padded_mask_at_two_wavelengths() -> None:
-    """The second caller stores its lattice between the first one's store and read."""
-    other_is_done, first_has_stored = threading.Event(), threading.Event()
-    short, long = 4.0e-6, 5.0e-6
-
-    class Interrupted(Cache[torch.dtype, tuple[Position, torch.Tensor]]):
-        def __setitem__(self, key: torch.dtype, made: tuple[Position, torch.Tensor]) -> None:
-            super().__setitem__(key, made)
-            if made[0] == (("wavelength", short),):
-                first_has_stored.set()
-                other_is_done.wait(5)
-
-    def transmission(wavelength: float) -> torch.Tensor:
-        return torch.full((16, 16), wavelength * 1e6, dtype=torch.float64)
-
-    grid = PupilGrid.full(8, JWST_DIAMETER)
-    field = torch.ones(8, 8, dtype=torch.complex128)
-    mask = FourierMask(transmission, 2, 8, JWST_DIAMETER, "padded")
-    mask._latest = Interrupted()
-
-    def call(wavelength: float) -> torch.Tensor:
-        return mask.apply(Wavefront(field, wavelength, grid), {}, grid).field
-
-    with ThreadPoolExecutor(2) as pool:
-        first = pool.submit(call, short)
-        assert first_has_stored.wait(5)
-        second = pool.submit(call, long)
-        np.testing.assert_allclose(second.result().real, 5.0, rtol=1e-12)
-        other_is_done.set()
-        np.testing.assert_allclose(first.result().real, 4.0, rtol=1e-12)
-
-
 @pytest.mark.parametrize("suffix", [".fits", pytest.param(".fits.gz", marks=pytest.mark.slow)])
-def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(
-    tmp_path: Path, suffix: str, killed: Callable[[str, Path], None]
-) -> None:
+def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(tmp_path, suffix, killed):
     """Half of the new file is on the disk when the process is killed."""
     path = tmp_path / f"product{suffix}"
     write_fits(fits.HDUList([fits.PrimaryHDU(np.zeros((70, 70)))]), path)
@@ -153,10 +114,3 @@ def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(
     with open_fits(path) as hdus:
         assert hdus[0].data.shape == (70, 70)
         assert not hdus[0].data.any()
-
-
-def test_npix_of_the_shared_wavefront() -> None:
-    """Guards the comparisons above: not flat, not symmetric."""
-    map_ = wavefront().numpy()
-    assert map_.shape == (NPIX, NPIX)
-    assert min(np.abs(map_ - t).max() for t in (map_.T, map_[::-1], map_[:, ::-1])) > 1e-8
