@@ -21,6 +21,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
@@ -75,10 +76,11 @@ def detection_figure() -> Figure:
 def status_figure() -> Figure:
     """A frame, its star and the residual, for a fit that explains it and one that does not."""
     figure, axes = drawing.new_figure(2, 3)
+    figure.set_size_inches(13.8, 7.2)
     settings = dr.GaussNewton(cycles=(6, 12))
     seen = frame(3, planets=())
     explained = dr.refine(model(), seen, opd(), settings=settings)
-    pattern = 1 + 0.05 * np.random.default_rng(5).normal(size=(SIDE, SIDE))
+    pattern = 1 + 0.01 * np.random.default_rng(5).normal(size=(SIDE, SIDE))
     changed = replace(seen, data=seen.data * pattern)
     mismatched = dr.refine(model(), changed, opd(), settings=settings)
     # What the caption says.
@@ -126,7 +128,7 @@ def klip_figure() -> Figure:
             )  # fmt: skip
             settings = {
                 "model": model(), "fit": SETTINGS, "fit_pixels": SIDE, "filter": "F444W",
-                "error": np.sqrt(np.maximum(cube, 1.0)), "opd": opd(), "plan": "off",
+                "error": np.sqrt(np.maximum(cube, 1.0)), "opd": opd(),
             }  # fmt: skip
             # Inside the block of the backend, "klip" would be taken over as well.
             with dr.backend(**settings) if algorithm != "klip" else nullcontext():
@@ -136,13 +138,15 @@ def klip_figure() -> Figure:
                 )  # fmt: skip
             images[title] = fits.getdata(Path(folder) / f"{algorithm}-KLmodes-all.fits")[0]
     figure, axes = drawing.new_figure(1, 2)
+    limit = max(float(np.nanpercentile(np.abs(each), 99)) for each in images.values())
+    angle = np.deg2rad(PLANET.position_angle)
+    place = (-PLANET.separation * np.sin(angle), PLANET.separation * np.cos(angle))
     for ax, (title, image) in zip(axes[0], images.items(), strict=True):
         ny, nx = image.shape
         y, x = np.indices(image.shape)
         grid = np.stack([x - (nx - 1) / 2, y - (ny - 1) / 2], axis=-1) * 0.0624
-        shown = np.nan_to_num(image)
-        limit = float(np.percentile(np.abs(shown), 99))
-        drawing.signed_image(ax, shown, grid, limit, bar="photons", title=title)
+        drawing.signed_image(ax, np.nan_to_num(image), grid, limit, bar="photons", title=title)
+        ax.add_patch(Circle(place, 0.2, fill=False, color="k"))
     return figure
 
 
