@@ -17,6 +17,9 @@ import numpy as np
 import pytest
 from astropy.table import MaskedColumn, Table
 
+from pyklip_diffrender import Status
+from pyklip_diffrender.reduction.pages import advice
+
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 
@@ -393,6 +396,19 @@ ALLOWED = {
     "paper/paper.md": {"10", "@carter2023"},
 }
 """Words with digits that are left: settings, and errors that the text explains elsewhere."""
+
+
+def test_how_often_real_frames_are_not_explained() -> None:
+    """The advice about a status says how often it comes, of the reductions on the page."""
+    name, explained = "chi-squared per pixel", 1.2  # the limit of CONVERGED
+    pairs = [stated(f"{name}, {each}", setting="two rolls") for each in ("smallest", "largest")]
+    assert max(pairs) < explained
+    others = [stated(name, star="AU Mic", filter=each, setting="disk=True") for each in BOTH]
+    others.append(stated(name, star="HIP 65426", setting=""))
+    missed = sum(each > explained for each in others)
+    phrase = f"{missed} of the {len(PAIRS) + len(others)} reductions"
+    assert phrase in advice(Status.MODEL_MISMATCH, patterned=True)
+    assert phrase in (ROOT / "docs/howto/status.md").read_text(encoding="utf-8")
 
 
 def test_the_page_of_real_frames_has_few_numbers() -> None:
