@@ -143,7 +143,7 @@ def marginalised_figure() -> Figure:
     grid = np.stack(np.meshgrid(axis, axis), axis=-1)
     for ax, (title, image) in zip(axes[0], images.items(), strict=True):
         drawing.signed_image(
-            ax, image / white.max(), grid, 1.0, bar="image / noise, of the peak", title=title
+            ax, image / white.max(), grid, 0.6, bar="image / noise, of the peak", title=title
         )
     # The caption states how much of the S/N remains.
     share = float(np.sqrt(np.sum(white * remaining) / np.sum(white**2)))

@@ -59,8 +59,8 @@ _ADVICE = {
     ),
     Status.PRIOR_MISMATCH: (
         "The errors have been scaled to the scatter in the S/N map. Repeat the reduction with a "
-        "wavefront map nearer in time, or let the fit determine how much the wavefront may "
-        "change: WavefrontPrior(fit_scales=True)."
+        "wavefront map nearer in time or, in Python, with WavefrontPrior(fit_scales=True), which "
+        "lets the data determine how much the wavefront may change."
     ),
     Status.ITERATION_LIMIT: (
         "Look at the history of the fit. If chi-squared was still falling, repeat the fit with a "
