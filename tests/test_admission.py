@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -417,11 +418,21 @@ def test_a_star_a_few_pixels_from_its_stated_place_is_behind_the_mask(folder, x)
     assert uses(dr.Sequence.from_files(folder))["x.fits"] == "target"
 
 
-def test_nothing_usable_is_an_error_with_all_reasons(folder):
-    for path in folder.glob("jw*"):
+def test_nothing_usable_is_an_error_with_every_reason_once(folder):
+    paths = sorted(folder.glob("jw*"))
+    for path in paths:
         fits.setval(path, "EXP_TYPE", value="NRC_TACQ")
-    with pytest.raises(NoValidPixelsError, match=r"none of 3 files .*NRC_TACQ.*NRC_TACQ"):
+    names = ", ".join(path.name for path in paths)
+    with pytest.raises(NoValidPixelsError) as raised:
         dr.Sequence.from_files(folder)
+    assert str(raised.value).startswith(f"none of 3 files can be used: {names}: ")
+    assert str(raised.value).count("NRC_TACQ") == 1
+    for k in range(2):
+        shutil.copy(paths[0], folder / f"z{k}.fits")
+    with pytest.raises(NoValidPixelsError, match=rf"5 files can .*{names} and 2 more: .*NRC_TACQ"):
+        dr.Sequence.from_files(folder)
+    with pytest.raises(NoValidPixelsError, match=r"the file cannot be used: z0.fits: .*NRC_TACQ"):
+        dr.Sequence.from_files([folder / "z0.fits"])
 
 
 @pytest.mark.parametrize("name", ["F356W", "F444W"])

@@ -51,15 +51,16 @@ _TINY = 1e-9
 _ADVICE = {
     Status.CONVERGED: "The stated errors and limits can be used as they are.",
     Status.MODEL_MISMATCH: (
-        "Fits of real frames often end with this status, mostly because the flat-field pattern is "
-        "not known or light is extended. The errors have been scaled to the scatter in the S/N "
-        "map, but faint candidates deserve a second look: see whether they are in every roll and "
-        "whether they look like a point source. Check the filter, the masks and the date of the "
-        "wavefront map."
+        "3 of the 7 reductions of real frames in the documentation end with this status: two of a "
+        "star with a disk, and one with a flat-field pattern that is not that of the library. The "
+        "errors have been scaled to the scatter in the S/N map. See whether a faint candidate is "
+        "in every roll and looks like a point source, and check the filter, the masks and the date "
+        "of the wavefront map."
     ),
     Status.PRIOR_MISMATCH: (
-        "The errors have been scaled to the scatter in the S/N map. Repeat the fit with "
-        "fit_scales=True, with wider scales, or with a wavefront map nearer in time."
+        "The errors have been scaled to the scatter in the S/N map. Repeat the reduction with a "
+        "wavefront map nearer in time or, in Python, with WavefrontPrior(fit_scales=True), which "
+        "lets the data determine how much the wavefront may change."
     ),
     Status.ITERATION_LIMIT: (
         "Look at the history of the fit. If chi-squared was still falling, repeat the fit with a "

@@ -76,9 +76,9 @@ MAX_CHI2 = 100.0
 
 _ADVICE = {
     "MODEL_MISMATCH": (
-        "usual for real frames whose flat-field pattern is not known. Check the filter, the masks "
-        "and the date of the wavefront map; reference frames and systematics='references' help, "
-        "and disk=True for a star with a disk"
+        "check the filter, the masks and the date of the wavefront map. Where the flat-field "
+        "pattern is not known, add reference frames (systematics='references'); for a star with a "
+        "disk, set disk=True"
     ),
     "PRIOR_MISMATCH": (
         "take a wavefront map nearer in time, or let the scales of the prior be fitted "

@@ -83,8 +83,8 @@ class Status(Enum):
         "converged, but the model does not explain the data: errors include a model error"
     )
     PRIOR_MISMATCH = (
-        "converged, but the wavefront is improbable under a prior that was held fixed, so that "
-        "errors are too small; let the prior's scales be fitted (fit_scales=True), or widen them"
+        "converged, but the wavefront has changed more than its prior allows, so that the errors "
+        "are too small"
     )
     ITERATION_LIMIT = "stopped at the limit of iterations before it converged"
     DIVERGED = "the fitted star has no light, or the loss is not a number"

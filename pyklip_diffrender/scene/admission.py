@@ -41,6 +41,7 @@ __all__ = [
     "exposures_in",
     "frames_by_star",
     "judge_frames",
+    "reasons_of",
     "require_agreement",
     "require_some",
     "with_references",
@@ -325,8 +326,20 @@ def _same_exposure(best: FrameFile) -> str:
 def require_some(files: Sequence[FrameFile]) -> None:
     """Raise `NoValidPixelsError`, with the reasons, if every file is excluded."""
     if not admissible(files):
-        reasons = "; ".join(f"{each.name}: {each.reason}" for each in files)
-        raise NoValidPixelsError(f"none of {len(files)} files can be used: {reasons}")
+        few = "the file cannot" if len(files) == 1 else f"none of {len(files)} files can"
+        raise NoValidPixelsError(f"{few} be used: {reasons_of(files)}")
+
+
+def reasons_of(files: Sequence[FrameFile]) -> str:
+    """Why files are excluded, each reason once with the names of the first files it is for."""
+    names: dict[str, list[str]] = {}
+    for each in files:
+        names.setdefault(each.reason, []).append(each.name)
+    parts = []
+    for reason, those in names.items():
+        more = f" and {len(those) - 3} more" if len(those) > 3 else ""
+        parts.append(f"{', '.join(those[:3])}{more}: {reason}")
+    return "; ".join(parts)
 
 
 # Decide which files belong to a sequence, as what, and why the others do not.

@@ -30,6 +30,7 @@ from pyklip_diffrender.scene.admission import (
     exclude_unusable,
     exposures_in,
     judge_frames,
+    reasons_of,
     require_some,
     with_references,
 )
@@ -349,8 +350,9 @@ class Sequence:
             exclude_contradicting(group, why_other_brightness)
         exclude_unoriented(science)
         if all(each.reason for each in science):
-            reasons = "; ".join(f"{each.name}: {each.reason}" for each in science)
-            raise NoValidPixelsError(f"{star}: no frames of the target can be used: {reasons}")
+            raise NoValidPixelsError(
+                f"{star}: no frames of the target can be used: {reasons_of(science)}"
+            )
         kept = [each for each in science if not each.reason]
         epochs = epochs_of([each.exposure.date for each in kept])
         return tuple(

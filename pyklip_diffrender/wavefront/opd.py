@@ -24,6 +24,7 @@ from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
     IncompatibleSetupError,
+    MissingFileError,
     MissingOPDError,
     NonFiniteError,
     ShapeError,
@@ -123,6 +124,8 @@ def read_opd(
             f"{path} is a folder, expected a file. choose_map(folder, date) takes the map of a "
             "folder that is nearest to a date"
         )
+    if not path.exists():
+        raise MissingFileError(f"{path}: no such file, expected that of a wavefront map")
     with open_fits(path) as hdus:
         if extension is None and EXTENSION in hdus:
             return _checked(load_wss_opd(path))
