@@ -18,7 +18,6 @@ from scipy import stats
 from synthetic_searches import CURVATURE, PIXEL, noise, searched
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.cli.reducing import combined
 from pyklip_diffrender.detection import Detection, Motion, SkyMap, hypotheses
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.sky_map import Family, SkyStack
@@ -26,6 +25,7 @@ from pyklip_diffrender.detection.templates import weigh
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.linear.model import LinearModel, Unknown
+from pyklip_diffrender.reduction import search_together
 
 MOTION = (0.3, -0.2)
 YEAR = 365.25
@@ -134,11 +134,10 @@ def test_a_combination_of_products_is_that_of_the_detections(
     json.dumps(read.to_dict(), allow_nan=False)
     with pytest.raises(FileExistsError):
         read.write(tmp_path / "both")
-    options = {"star_sed": None, "motion": None, "parallax": None}
-    by_command = combined(folders, ("free",), **options)
+    by_command = search_together(folders, spectra=("free",))
     assert list(by_command.thresholds) == ["all filters, spectra", "all filters, free"]
-    # The command has finished the reductions, so that a search that is not possible is no error.
-    assert "expected two or more" in combined(folders[:1], (), **options)
+    # The reductions are finished, so that a search that is not possible is no error.
+    assert "expected two or more" in search_together(folders[:1])
 
 
 def test_a_planet_too_faint_for_each_filter_is_a_candidate_of_both() -> None:

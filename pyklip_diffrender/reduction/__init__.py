@@ -12,9 +12,12 @@ from pyklip_diffrender.reduction.products import (
 from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
+    SPECTRA,
+    by_star,
     combined_rows,
     compare_reductions,
     in_words,
+    search_together,
     write_comparison,
 )
 from pyklip_diffrender.reduction.summary import summarise
@@ -23,6 +26,7 @@ from pyklip_diffrender.reduction.visit import Contribution, Visit
 __all__ = [
     "COMPARISON",
     "PRODUCTS",
+    "SPECTRA",
     "UNFINISHED",
     "Contribution",
     "Preparation",
@@ -30,12 +34,14 @@ __all__ = [
     "ReduceOptions",
     "Reduction",
     "Visit",
+    "by_star",
     "combined_rows",
     "compare_reductions",
     "existing_products",
     "in_words",
     "prepare",
     "reduce",
+    "search_together",
     "summarise",
     "write_comparison",
     "write_products",
