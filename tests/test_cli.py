@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tomllib
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import import_module
@@ -24,6 +25,7 @@ import pytest
 import torch
 from astropy.io import fits
 from astropy.time import Time
+from synthetic_searches import searched, write_searched
 
 from benchmarks.calints_files import calints
 from pyklip_diffrender import __version__
@@ -444,6 +446,43 @@ def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
     assert "--resume keeps products" in capsys.readouterr().err
 
 
+def test_a_resumed_command_keeps_reductions_and_searches_them_together_again(
+    tmp_path: Path, maps: Path, reduced: Reduced, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two filters, of which one had finished before the interruption."""
+    frames, products = tmp_path / "frames", tmp_path / "products"
+    frames.mkdir()
+    place = (0.6, 0.35)
+    made = {
+        "F356W": searched("F356W", 2, [(*place, 4.0)]),
+        "F444W": searched("F444W", 1, [(*place, 4.2)], north=20.0),
+    }
+    for name in made:
+        path = frames / f"{name}_calints.fits"
+        calints_file(path, "HIP-1", reference=False)
+        fits.setval(path, "FILTER", value=name)
+    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "--size", "8"]
+    write_searched(made["F356W"], products / "F356W")
+    reduced.error = KeyboardInterrupt()
+    assert main([*arguments, "--resume"]) == 130
+    assert not (products / "combined.fits").exists()
+    reduced.error = None
+    before = (products / "F356W" / "detection.fits").stat().st_mtime_ns
+    reduced.writes = lambda folder: write_searched(made[folder.name], folder)
+    assert main([*arguments, "--resume"]) == 0
+    shown = capsys.readouterr().out
+    assert f"{products / 'F356W'}: this reduction has finished" in shown
+    assert "combined search of 2 reductions: 1 candidate" in shown
+    assert (products / "F356W" / "detection.fits").stat().st_mtime_ns == before
+    assert len(reduced) == 1
+    # With nothing left to reduce, the search is made again: now with one spectrum.
+    assert main([*arguments, "--resume", "--spectra", "flat"]) == 0
+    assert len(reduced) == 1
+    assert fits.getdata(products / "combined.fits", "SNR").shape[0] == 1
+    content = json.loads((products / "comparison.json").read_text(encoding="utf-8"))
+    assert [each["name"] for each in content["combined"]["spectra"]] == ["flat"]
+
+
 def test_frames_without_a_map_start_from_a_flat_wavefront(
     tmp_path: Path, frames: Path, reduced: Reduced, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -505,10 +544,14 @@ class StubReduction:
     given: Preparation
     progress: bool
     interrupted: bool
+    writes: Callable[[Path], None] | None = None
 
     def write(self, folder: Path, **_: Any) -> list[Path]:
         folder.mkdir(exist_ok=True)
         path = folder / "summary.json"
+        if self.writes is not None:
+            self.writes(folder)
+            return [folder / "report.html", path]
         path.write_text(json.dumps(SUMMARY))
         if self.interrupted:
             raise KeyboardInterrupt
@@ -520,6 +563,7 @@ class Reduced(list[StubReduction]):
 
     error: BaseException | None = None
     interrupted_writing = False
+    writes: Callable[[Path], None] | None = None
 
 
 @pytest.fixture
@@ -534,7 +578,7 @@ def reduced(monkeypatch: pytest.MonkeyPatch) -> Reduced:
                 warnings.warn("the map is old", DiffrenderWarning, stacklevel=1)
         if made.error is not None:
             raise made.error
-        made.append(StubReduction(given, progress, made.interrupted_writing))
+        made.append(StubReduction(given, progress, made.interrupted_writing, made.writes))
         return made[-1]
 
     monkeypatch.setattr(Preparation, "run", stub)

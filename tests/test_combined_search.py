@@ -230,6 +230,19 @@ def test_a_bad_fit_is_left_out_and_its_candidates_with_it() -> None:
         dr.combine([bad, good[0]])
 
 
+def test_frames_count_once() -> None:
+    """Two reductions of one frame, as with other options, are not two observations."""
+    one = searched("F444W", 1, [(0.6, 0.3, 4.0)])
+    again, other = searched("F444W", 1, [(0.6, 0.3, 4.0)], error=2e-6), searched("F356W", 2)
+    both = dr.combine([one, again, other])
+    assert [each.filter for each in both.maps] == ["F444W", "F356W"]
+    ((name, reason),) = both.left_out
+    assert (name, reason) == ("F444W 2023-02-25 (2)", "its frames are those of F444W 2023-02-25")
+    np.testing.assert_array_equal(both.snr, dr.combine([one, other]).snr)
+    with pytest.raises(IncompatibleSetupError, match=r"of which 1 can be used.*are those of"):
+        dr.combine([one, again])
+
+
 def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path: Path) -> None:
     one = searched("F444W", 1, header={"TARGPROP": "HD 1", "TARG_RA": 10.0, "TARG_DEC": 5.0})
     other = searched("F356W", 2, header={"TARGPROP": "HD 2", "TARG_RA": 90.0, "TARG_DEC": 5.0})

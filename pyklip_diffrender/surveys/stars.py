@@ -31,6 +31,9 @@ __all__ = ["FOLDER", "StarSearch", "search_stars"]
 FOLDER = "combined"
 """Folder of the searches of stars, in that of the survey."""
 
+Group = Sequence[tuple[Job, Detection]]
+"""Jobs of one star with their searches, in order of time."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -99,7 +102,7 @@ def search_stars(
             dated = sorted(group, key=lambda key: (group[key].sky.mjd or 0.0, str(jobs[key])))
             try:
                 found.append(
-                    _search(star, {jobs[key]: group[key] for key in dated}, output, spectra)
+                    _search(star, [(jobs[key], group[key]) for key in dated], output, spectra)
                 )
             except OSError as error:
                 raise IncompatibleSetupError(
@@ -110,14 +113,13 @@ def search_stars(
     return found
 
 
-def _search(
-    star: str, group: Mapping[Job, Detection], output: Path, spectra: Sequence[str]
-) -> StarSearch:
+def _search(star: str, group: Group, output: Path, spectra: Sequence[str]) -> StarSearch:
     """Search one star, unless that was done before."""
     listed = [sha256(each) if os.path.isfile(each) else each for each in spectra]
-    key = hash_of({"version": __version__, "jobs": [job.key for job in group], "spectra": listed})
+    keys = [job.key for job, _ in group]
+    key = hash_of({"version": __version__, "jobs": keys, "spectra": listed})
     final = output / FOLDER / folder_of(star, key)
-    names = tuple(str(job) for job in group)
+    names = tuple(str(job) for job, _ in group)
     data = final / COMPARISON[1]
     if not data.exists():
         _write(star, group, final, spectra)
@@ -125,23 +127,20 @@ def _search(
     return StarSearch(star, final.relative_to(output).as_posix(), names, combined)
 
 
-def _write(
-    star: str, group: Mapping[Job, Detection], final: Path, spectra: Sequence[str]
-) -> None:
+def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None:
     """Search one star, and publish the folder with the products as a whole."""
     final.parent.mkdir(exist_ok=True)
     clean(final.parent)
-    motions = (
-        proper_motion(each.observation.header, each.observation.name) for each in group.values()
-    )
+    detections = [each for _, each in group]
+    motions = [proper_motion(each.observation.header, each.observation.name) for each in detections]
     motion = next((each for each in motions if each is not None), None)
-    combination = search_together(list(group.values()), spectra=spectra, motion=motion)
+    combination = search_together(detections, spectra=spectra, motion=motion)
     _log.info("%s: %s", star, in_words(combination))
     jobs = final.parent.parent / "jobs"
     summaries = {
         # Relative to the folder of the search.
         f"../../jobs/{job.folder}": json.loads(read_text(jobs / job.folder / "summary.json"))
-        for job in group
+        for job, _ in group
     }
     folder = staging(final.parent, "star")
     try:
