@@ -676,8 +676,9 @@ def test_filters_of_a_star_are_searched_together_at_the_end(
 
 
 def test_a_combined_search_is_kept_until_its_jobs_or_spectra_change(
-    tmp_path: Path, do: Callable[[Work], None]
+    tmp_path: Path, do: Callable[[Work], None], caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("INFO")
     do(searching)
     config = inputs(tmp_path / "data", 3)
     output, first = tmp_path / "out", {**config, "sequence": config["sequence"][:2]}
@@ -687,6 +688,7 @@ def test_a_combined_search_is_kept_until_its_jobs_or_spectra_change(
     page.write_text("kept")
     assert survey(first, output).meta["combined"] == [before]
     assert page.read_text() == "kept"
+    assert caplog.text.count("combined search of") == 1
     (flat,) = survey({**first, "combined": {"spectra": ["flat"]}}, output).meta["combined"]
     assert [each["name"] for each in flat["spectra"]] == ["flat"]
     assert not flat["free"]
