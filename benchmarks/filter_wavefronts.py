@@ -24,7 +24,6 @@ import numpy as np
 import torch
 
 import pyklip_diffrender as dr
-from benchmarks.both_arms import information
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.optics.grid import zernike_basis
 
@@ -76,17 +75,29 @@ class Filter:
         return np.asarray(np.median(errors.reshape(len(SEPARATIONS), -1), axis=1))
 
 
-def read(folder: Path) -> tuple[Filter, dr.Refinement]:
-    """Read the fit of a filter, and linearise what it says about its modes."""
-    fit = dr.Refinement.read(folder / "fit.fits")
+def information(linear: dr.LinearModel, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Indices of the leading modes, and what the frames say of them, without their prior."""
+    leading = torch.tensor(
+        [each.name == "modes" and each.component < count for each in linear.unknowns]
+    )
+    modes, rest = torch.nonzero(leading).flatten(), torch.nonzero(~leading).flatten()
+    own = linear.curvature[rest][:, rest].double()
+    own.diagonal().add_(linear.deviation[rest] ** -2.0)
+    mixed = linear.curvature[rest][:, modes].double()
+    shared = linear.curvature[modes][:, modes].double()
+    return modes, shared - mixed.T @ torch.linalg.solve(own, mixed)
+
+
+def linearised(fit: dr.Refinement, count: int) -> Filter:
+    """What the fit of a filter says about its leading modes."""
     ((linear, templates),) = groups_of([fit])
-    modes, shared = information(linear)
+    modes, shared = information(linear, count)
     angles = np.arange(0, 2 * np.pi, np.pi / 3)
     offsets = [(r * np.cos(t), r * np.sin(t)) for r in SEPARATIONS for t in angles]
     images = templates.at(torch.tensor(offsets, dtype=torch.float64))
     name = str(fit.frames[0].observation.filter)
     vector, deviation = linear.vector[modes].double(), linear.deviation[modes].double()
-    return Filter(name, linear, images, modes, shared.double(), vector, deviation), fit
+    return Filter(name, linear, images, modes, shared, vector, deviation)
 
 
 def zernikes_in(fit: dr.Refinement, noll: tuple[int, ...]) -> torch.Tensor:
@@ -154,10 +165,11 @@ def main() -> None:
     parser.add_argument("folders", nargs=2, type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    (one, fit), (two, other) = (read(folder) for folder in options.folders)
-    count = len(one.best)
-    if len(two.best) != count:
-        parser.error(f"the fits have {count} and {len(two.best)} modes, expected as many")
+    fits = [dr.Refinement.read(folder / "fit.fits") for folder in options.folders]
+    # A basis begins with the modes of a shorter one; those beyond are the longer one's own.
+    fit, other = sorted(fits, key=lambda each: len(each.basis))
+    count = len(fit.basis)
+    one, two = (linearised(each, count) for each in (fit, other))
     frequency = fit.basis.frequencies
     segments = frequency == 0
     print(f"prior scales, nm: {fit.scales}, {other.scales}")
@@ -165,6 +177,7 @@ def main() -> None:
     print(f"difference of the separate fits: norm {spread:.1f} nm; of each "
           f"{float(one.best.norm()):.1f}, {float(two.best.norm()):.1f}")  # fmt: skip
     print("| may differ | modes | rise of chi-squared | rms of the difference, nm |")
+    print(f"modes: {count} of {one.name} and of {two.name}, which has {len(other.basis)}")
     everything = torch.eye(count, dtype=torch.float64)
     none = everything[:, :0]
     print(
@@ -176,7 +189,10 @@ def main() -> None:
         cases[name] = (shape, torch.full((len(noll),), FREE, dtype=torch.float64))
     bands = {
         "segments": segments,
-        **{f"texture up to {top:g} cycles": (frequency > 0) & (frequency <= top) for top in (2, 4, 8)},
+        **{
+            f"texture up to {top} cycles": (frequency > 0) & (frequency <= top)
+            for top in (2, 4, 8)
+        },
         "segments and texture up to 8 cycles": frequency <= 8,
         "texture beyond 8 cycles": frequency > 8,
         "all modes": frequency >= 0,
