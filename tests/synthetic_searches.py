@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import torch
 from astropy.io import fits
@@ -96,5 +98,23 @@ def searched(
         header=fits.Header(header or {}),
     )  # fmt: skip
     sky = Sky(north, mjd, None if star is None else (star, 0.1 * star))
-    vars(detection).update(observation=observation, sky=sky, provenance={"status": status})
+    vars(detection).update(
+        observation=observation, sky=sky, provenance={"status": status}, rolls=1, subtracted=(),
+        _wcs=(), _digests=(), _calibration_errors=np.zeros((2, len(own) if known else 0)),
+    )  # fmt: skip
     return detection
+
+
+def write_searched(detection, folder):
+    """Write the products of a reduction that a search over several reductions reads."""
+    detection.write(folder)
+    status = str(detection.provenance["status"])
+    summary = {
+        "target": detection.observation.target, "filter": detection.observation.filter,
+        "oriented": True, "epoch_mjd": detection.sky.mjd, "first_date": detection.sky.date,
+        "sentence": "No companion.", "candidates": [], "threshold_snr": detection.threshold,
+        "contrast_curve": {"sigmas": 5.0, "separation_arcsec": [], "contrast": []},
+        "status": {"name": status, "message": "converged", "advice": "Use it."},
+    }  # fmt: skip
+    (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    (folder / "report.html").write_text("<p>report</p>", encoding="utf-8")

@@ -8,6 +8,7 @@ import re
 import shutil
 import tomllib
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
@@ -20,6 +21,7 @@ import pytest
 import torch
 from astropy.io import fits
 from small_files import calints
+from synthetic_searches import searched, write_searched
 
 from pyklip_diffrender.cli import application, main
 from pyklip_diffrender.cli.session import read_config
@@ -317,6 +319,43 @@ def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
     assert "--resume keeps products" in capsys.readouterr().err
 
 
+def test_a_resumed_command_keeps_reductions_and_searches_them_together_again(
+    tmp_path, maps, reduced, capsys
+):
+    """Two filters, of which one had finished before the interruption."""
+    frames, products = tmp_path / "frames", tmp_path / "products"
+    frames.mkdir()
+    place = (0.6, 0.35)
+    made = {
+        "F356W": searched("F356W", 2, [(*place, 4.0)]),
+        "F444W": searched("F444W", 1, [(*place, 4.2)], north=20.0),
+    }
+    for name in made:
+        path = frames / f"{name}_calints.fits"
+        cards = {"TARGPROP": "HIP-1", "FILTER": name, "INSTRUME": None}
+        calints(path, np.random.default_rng(1).normal(10, 2, (2, 8, 10)), primary=cards)
+    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "--size", "8"]
+    write_searched(made["F356W"], products / "F356W")
+    reduced.error = KeyboardInterrupt()
+    assert main([*arguments, "--resume"]) == 130
+    assert not (products / "combined.fits").exists()
+    reduced.error = None
+    before = (products / "F356W" / "detection.fits").stat().st_mtime_ns
+    reduced.writes = lambda folder: write_searched(made[folder.name], folder)
+    assert main([*arguments, "--resume"]) == 0
+    shown = capsys.readouterr().out
+    assert f"{products / 'F356W'}: this reduction has finished" in shown
+    assert "combined search of 2 reductions: 1 candidate" in shown
+    assert (products / "F356W" / "detection.fits").stat().st_mtime_ns == before
+    assert len(reduced) == 1
+    # With nothing left to reduce, the search is made again: now with one spectrum.
+    assert main([*arguments, "--resume", "--spectra", "flat"]) == 0
+    assert len(reduced) == 1
+    assert fits.getdata(products / "combined.fits", "SNR").shape[0] == 1
+    content = json.loads((products / "comparison.json").read_text(encoding="utf-8"))
+    assert [each["name"] for each in content["combined"]["spectra"]] == ["flat"]
+
+
 SUMMARY = {
     "sentence": "One companion.",
     "status": {
@@ -332,10 +371,14 @@ class StubReduction:
     given: Preparation
     progress: bool
     interrupted: bool
+    writes: Callable[[Path], None] | None = None
 
     def write(self, folder, **_):
         folder.mkdir(exist_ok=True)
         path = folder / "summary.json"
+        if self.writes is not None:
+            self.writes(folder)
+            return [folder / "report.html", path]
         path.write_text(json.dumps(SUMMARY))
         if self.interrupted:
             raise KeyboardInterrupt
@@ -347,6 +390,7 @@ class Reduced(list[StubReduction]):
 
     error: BaseException | None = None
     interrupted_writing = False
+    writes: Callable[[Path], None] | None = None
 
 
 @pytest.fixture
@@ -361,7 +405,7 @@ def reduced(monkeypatch):
                 warnings.warn("the map is old", DiffrenderWarning, stacklevel=1)
         if made.error is not None:
             raise made.error
-        made.append(StubReduction(given, progress, made.interrupted_writing))
+        made.append(StubReduction(given, progress, made.interrupted_writing, made.writes))
         return made[-1]
 
     monkeypatch.setattr(Preparation, "run", stub)

@@ -17,7 +17,6 @@ from scipy import stats
 from synthetic_searches import CURVATURE, PIXEL, noise, searched
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.cli.reducing import combined
 from pyklip_diffrender.detection import Motion
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.sky_map import Family, SkyStack
@@ -25,6 +24,7 @@ from pyklip_diffrender.detection.templates import weigh
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.linear.model import LinearModel, Unknown
+from pyklip_diffrender.reduction import search_together
 
 MOTION = (0.3, -0.2)
 YEAR = 365.25
@@ -131,11 +131,10 @@ def test_a_combination_of_products_is_that_of_the_detections(pair, tmp_path):
     json.dumps(read.to_dict(), allow_nan=False)
     with pytest.raises(FileExistsError):
         read.write(tmp_path / "both")
-    options = {"star_sed": None, "motion": None, "parallax": None}
-    by_command = combined(folders, ("free",), **options)
+    by_command = search_together(folders, spectra=("free",))
     assert list(by_command.thresholds) == ["all filters, spectra", "all filters, free"]
-    # The command has finished the reductions, so that a search that is not possible is no error.
-    assert "expected two or more" in combined(folders[:1], (), **options)
+    # The reductions are finished, so that a search that is not possible is no error.
+    assert "expected two or more" in search_together(folders[:1])
 
 
 def test_a_planet_too_faint_for_each_filter_is_a_candidate_of_both():
@@ -208,6 +207,19 @@ def test_a_bad_fit_is_left_out_and_its_candidates_with_it():
     assert "MODEL_MISMATCH" in reason
     with pytest.raises(IncompatibleSetupError, match=r"expected two or more .*MODEL_MISMATCH"):
         dr.combine([bad, good[0]])
+
+
+def test_frames_count_once():
+    """Two reductions of one frame, as with other options, are not two observations."""
+    one = searched("F444W", 1, [(0.6, 0.3, 4.0)])
+    again, other = searched("F444W", 1, [(0.6, 0.3, 4.0)], error=2e-6), searched("F356W", 2)
+    both = dr.combine([one, again, other])
+    assert [each.filter for each in both.maps] == ["F444W", "F356W"]
+    ((name, reason),) = both.left_out
+    assert (name, reason) == ("F444W 2023-02-25 (2)", "its frames are those of F444W 2023-02-25")
+    np.testing.assert_array_equal(both.snr, dr.combine([one, other]).snr)
+    with pytest.raises(IncompatibleSetupError, match=r"of which 1 can be used.*are those of"):
+        dr.combine([one, again])
 
 
 def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path):

@@ -13,6 +13,7 @@ import torch
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
 from pyklip.instruments import JWST
+from synthetic_searches import searched
 
 from benchmarks.calints_files import calints
 from pyklip_diffrender import spaceklip
@@ -204,6 +205,51 @@ def test_a_failure_is_reported_after_the_others(tmp_path, monkeypatch, caplog):
     assert list(database.src[KEY][0]["CON"]) == [2e-5, 1e-5]
     with pytest.raises(ExceptionGroup):
         spaceklip.run_obs(database, opd=OPD, restrict_to="bad")
+
+
+def test_concatenations_of_one_target_are_searched_together(tmp_path, monkeypatch):
+    """A planet that is too faint for each of two filters; a bad fit and another star beside it."""
+    star, other = ({"TARGPROP": name, "TARG_RA": ra, "TARG_DEC": 5.0} for name, ra in
+                   (("HD 1", 10.0), ("HD 2", 90.0)))  # fmt: skip
+    place = (0.6, 0.35)
+    made = {
+        "F444W": searched("F444W", 1, [(*place, 4.2)], north=20.0, header=star),
+        "F356W": searched("F356W", 2, [(*place, 4.0)], header=star),
+        "F300M": searched("F300M", 3, status="MODEL_MISMATCH", header=star),
+        "other": searched("F444W", 4, header=other),
+    }
+    obs = {
+        key: concatenation(
+            [str(calints(tmp_path / f"{key}_calints.fits"))], FILTER=each.observation.filter
+        )
+        for key, each in made.items()
+    }
+
+    def reduced(key, table, judged, folder, *others):
+        header = {"TELESCOP": "JWST", "INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "FILTER": key,
+                  "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "SUBARRAY": "SUB320A335R",
+                  "MODE": "ADI", "ANNULI": 1, "SUBSECTS": 1, "KLMODE0": 1}  # fmt: skip
+        product = folder / f"{key}-KLmodes-all.fits"
+        fits.PrimaryHDU(header=fits.Header(header)).writeto(product, overwrite=True)
+        return product, made[key]
+
+    monkeypatch.setattr(run, "_reduced", reduced)
+    database = StandIn(tmp_path, obs)
+    with pytest.warns(DiffrenderWarning, match=r"HD 1: F300M .* is left out .*MODEL_MISMATCH"):
+        detections = spaceklip.run_obs(database, opd=OPD)
+    assert detections == made
+    (folder,) = (tmp_path / "diffrender").glob("combined_*")
+    assert folder.name == "combined_HD-1"
+    (row,) = QTable.read(folder / "combined_candidates.ecsv")
+    assert np.hypot(row["delta_ra"].value - 0.6, row["delta_dec"].value - 0.35) < 0.06
+    # A second call replaces the files; other spectra are those of the request.
+    with pytest.warns(DiffrenderWarning, match="left out"):
+        spaceklip.run_obs(database, opd=OPD, spectra=["flat"])
+    assert fits.getdata(folder / "combined.fits", "SNR").shape[0] == 1
+    # What cannot be searched together is a warning, and the concatenations are returned.
+    made["F356W"] = searched("F356W", 2, mjd=60400.0, header=star)
+    with pytest.warns(DiffrenderWarning, match="HD 1 has no combined search: .* several epochs"):
+        assert spaceklip.run_obs(database, opd=OPD) == made
 
 
 def test_files_are_judged_before_any_is_fitted(tmp_path):

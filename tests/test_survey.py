@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import QTable, Table
 from survey_stubs import HOSTILE, configuration, inputs, result, stub
+from synthetic_searches import searched, write_searched
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import CENTER, SIDE, calints
@@ -110,6 +111,9 @@ def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path)
         ((1,), "star_flux", -0.4, ["sequence 2: star_flux", "-0.4", "Jy"]),
         ((), "options", {"star_flux_error": 0}, ["options: star_flux_error", "0.05"]),
         ((), "options", {"disk": True, "wide": True}, ["options", "one of them"]),
+        ((), "combined", {"spectra": ["no.ecsv"]}, ["combined: spectra", "no.ecsv", "'flat'"]),
+        ((), "combined", {"spectra": []}, ["combined: spectra", "[]"]),
+        ((), "combined", {"parallax": 0.1}, ["combined: got the key 'parallax'", "spectra"]),
         ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
         ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
         ((0,), "files", "nowhere.fits", ["sequence 1: files", "nowhere.fits", "exist"]),
@@ -406,6 +410,109 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path):
     assert links
     for link in links:
         assert (output / link).exists()
+
+
+# -- filters and epochs of a star together ---------------------------------------------------------
+
+STAR = {"TARGPROP": "HD 1", "TARG_RA": 10.0, "TARG_DEC": 5.0}
+OTHER = {"TARGPROP": "HD 2", "TARG_RA": 90.0, "TARG_DEC": 5.0}
+PLACE = (0.6, 0.35)
+
+SEARCHED = {
+    "star0_calints": partial(searched, "F444W", 1, [(*PLACE, 4.2)], north=20.0, header=STAR),
+    "star1_calints": partial(searched, "F356W", 2, [(*PLACE, 4.0)], header=STAR),
+    "star2_calints": partial(searched, "F300M", 3, [(-0.5, 0.4, 30.0)], known=True,
+                             status="MODEL_MISMATCH", header=STAR),
+    "star3_calints": partial(searched, "F444W", 4, header=OTHER),
+}  # fmt: skip
+"""Searches by the name of the job: a planet that is too faint for each of two filters, a fit that
+does not explain its data, and another star."""
+
+
+def searching(job, folder):
+    """A job whose search is one of `SEARCHED`; nothing is fitted."""
+    write_searched(SEARCHED[job.name](), folder)
+    return result()
+
+
+def test_filters_of_a_star_are_searched_together_at_the_end(tmp_path, do, capsys):
+    do(searching)
+    config = inputs(tmp_path / "data", 4)
+    output = tmp_path / "out"
+    path = configuration(tmp_path / "survey.toml", config)
+    assert main(["survey", str(path), "-o", str(output), "-q"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("all filters and epochs") == 1
+    # 4.1 sqrt(2) and the noise of these seeds; each filter alone needs 5.
+    assert "HD 1, all filters and epochs: S/N 5.4 at 0.698 arcsec" in said
+    (folder,) = (output / "combined").iterdir()
+    assert folder.name.startswith("HD-1_")
+    assert {each.name for each in folder.iterdir()} == {
+        "combined.fits", "combined_candidates.ecsv", "combined_limits.ecsv", "comparison.html",
+        "comparison.json",
+    }  # fmt: skip
+    (row,) = QTable.read(folder / "combined_candidates.ecsv")
+    away = np.hypot(row["delta_ra"].value - PLACE[0], row["delta_dec"].value - PLACE[1])
+    assert away < 0.06
+    text = (output / "survey.html").read_text(encoding="utf-8")
+    section = text.partition("Filters and epochs together")[2].partition("</section>")[0]
+    assert "MODEL_MISMATCH" in section
+    assert "HD 2" not in section
+    (link,) = (a["href"] for tag, a in Tags(section).tags if tag == "a")
+    assert (output / str(link)).samefile(folder / "comparison.html")
+    inside = Tags((folder / "comparison.html").read_text(encoding="utf-8")).tags
+    reports = [a["href"] for tag, a in inside if tag == "a" and "report.html" in str(a["href"])]
+    assert len(reports) == 3
+    assert all((folder / str(each)).exists() for each in reports)
+
+
+def test_a_combined_search_is_kept_until_its_jobs_or_spectra_change(tmp_path, do, caplog):
+    caplog.set_level("INFO")
+    do(searching)
+    config = inputs(tmp_path / "data", 3)
+    output, first = tmp_path / "out", {**config, "sequence": config["sequence"][:2]}
+    (before,) = survey(first, output).meta["combined"]
+    assert before["filters"] == ["F444W", "F356W"]
+    page = output / before["folder"] / "comparison.html"
+    page.write_text("kept")
+    assert survey(first, output).meta["combined"] == [before]
+    assert page.read_text() == "kept"
+    assert caplog.text.count("combined search of") == 1
+    (flat,) = survey({**first, "combined": {"spectra": ["flat"]}}, output).meta["combined"]
+    assert [each["name"] for each in flat["spectra"]] == ["flat"]
+    assert not flat["free"]
+    (more,) = survey(config, output).meta["combined"]
+    assert len({each["folder"] for each in (before, flat, more)}) == 3
+    assert hidden(output) == []
+    assert not [each for each in (output / "combined").iterdir() if each.name.startswith(".")]
+
+
+def test_jobs_of_the_same_frames_count_once_and_what_cannot_be_searched_is_said(
+    tmp_path, do, capsys
+):
+    """Two jobs of one frame with other options are one observation; epochs need a motion."""
+    wide = partial(searched, "F444W", 1, [(*PLACE, 4.2)], north=20.0, header=STAR)
+    later = partial(searched, "F444W", 5, mjd=60400.0, header=STAR)
+
+    def work(job, folder):
+        given = {**SEARCHED, "wide": wide, "later": later}
+        write_searched(given[job.name](), folder)
+        return result()
+
+    do(work)
+    config = inputs(tmp_path / "data", 1)
+    config["sequence"].append({**config["sequence"][0], "name": "wide", "wide": True})
+    (twice,) = survey(config, tmp_path / "twice").meta["combined"]
+    assert "its frames are those of F444W 2023-02-25" in twice["reason"]
+    path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data", 2))
+    text = path.read_text().replace("star1_calints.fits'", "star1_calints.fits'\nname = 'later'")
+    path.write_text(text)
+    assert main(["survey", str(path), "-o", str(tmp_path / "epochs"), "-q"]) == 0
+    assert "HD 1: no combined search: combine: got reductions of several epochs" in (
+        capsys.readouterr().out
+    )
+    page = (tmp_path / "epochs" / "survey.html").read_text(encoding="utf-8")
+    assert "no combined search: combine: got reductions of several epochs" in page
 
 
 @pytest.mark.parametrize("missing", ["dask", "pyarrow"])

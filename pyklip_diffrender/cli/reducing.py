@@ -15,7 +15,7 @@ from typing import Any, Literal
 import click
 
 from pyklip_diffrender.cli.session import Run, config_remark, free_memory, with_options
-from pyklip_diffrender.detection import COMBINED, Combination, combine
+from pyklip_diffrender.detection import COMBINED, Combination
 from pyklip_diffrender.detection.recovery import TOGETHER
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
@@ -32,11 +32,13 @@ from pyklip_diffrender.pattern import (
 from pyklip_diffrender.reduction import (
     COMPARISON,
     PRODUCTS,
+    SPECTRA,
     UNFINISHED,
     ProductFolder,
     existing_products,
     in_words,
     prepare,
+    search_together,
     write_comparison,
 )
 from pyklip_diffrender.scene.exposure import proper_motion as motion_of
@@ -47,7 +49,6 @@ from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
 __all__ = [
-    "combined",
     "describe_plan",
     "map_for",
     "run",
@@ -271,9 +272,11 @@ def run_reduction(
         if several:
             first = sequences[0].science[0]
             motion = proper_motion or motion_of(first.header, first.name)
-            combination = combined(
-                folders, spectra, star_sed=star_sed, motion=motion, parallax=parallax
+            combination = search_together(
+                folders, spectra=spectra or SPECTRA, star=star_sed, motion=motion, parallax=parallax
             )
+            if isinstance(combination, str):
+                combination = with_options(combination)
             page, data = write_comparison(summaries, motion, output, combination)
             summary = loads(read_text(data))
             if isinstance(combination, Combination):
@@ -293,28 +296,6 @@ def _require_spectra(spectra: tuple[str, ...], filters: list[str]) -> None:
     listed = [each for each in spectra if each != "free"]
     if listed and len(filters) > 1 and "unknown" not in filters:
         planet_spectra(listed, filters)
-
-
-def combined(
-    folders: list[Path],
-    spectra: tuple[str, ...],
-    *,
-    star_sed: str | None,
-    motion: tuple[float, float] | None,
-    parallax: float | None,
-) -> Combination | str:
-    """Search the products in folders together; a sentence if that is not possible."""
-    try:
-        return combine(
-            folders,
-            spectra=spectra or ("blackbody", "flat", "free"),
-            star=star_sed,
-            proper_motion=motion,
-            parallax=parallax,
-        )
-    except IncompatibleSetupError as error:
-        # The reductions are finished, and worth more than a search that cannot be made of them.
-        return with_options(str(error))
 
 
 def _with_flux(options: ReduceOptions, star_sed: str | None, name: str | None) -> ReduceOptions:
@@ -421,6 +402,16 @@ def run(config: Path, output: Path, scheduler: str | None = None, *, progress: b
             f"  {row['name']}: S/N {row['snr']:.1f} at {row['separation_arcsec']:.3f} arcsec, "
             f"contrast {row['contrast']:.2e} +- {row['contrast_error']:.1e}"
         )
+    for star in table.meta["combined"]:
+        if "reason" in star:
+            click.echo(f"  {star['star']}: no combined search: {star['reason']}")
+            continue
+        for each in star["candidates"]:
+            verdict = f", {each['verdict']}" if "verdict" in each else ""
+            click.echo(
+                f"  {star['star']}, all filters and epochs: S/N {each['snr']:.1f} at "
+                f"{each['separation_arcsec']:.3f} arcsec ({each['spectrum']}){verdict}"
+            )
     for row in failed:
         click.echo(f"  {row['name']} failed: {row['message']}")
     for name in ("results.ecsv", "results.parquet", "survey.html"):

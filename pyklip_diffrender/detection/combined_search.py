@@ -103,7 +103,8 @@ def combine(
     ----------
     reductions : sequence of Reduction, Detection or path
         A path is that of a folder with the products of a reduction, of which ``detection.fits`` is
-        read. Those whose fit does not explain its data are left out.
+        read. Those whose fit does not explain its data are left out, as are those of frames that
+        another reduction has.
     spectra : str, path, or sequence of them
         "blackbody" (150 to 1,500 K), "flat" (the same flux density per frequency in all filters),
         the file of a table of spectra (see `planet_spectra`), and "free": any fluxes that are
@@ -509,9 +510,11 @@ def _usable(
 ) -> tuple[tuple[SkyMap, ...], tuple[tuple[str, str], ...]]:
     """Maps of the reductions that can be combined, and the others with the reason."""
     maps, left_out = [], []
+    shown: dict[tuple[str | None, float, str] | None, str] = {}
     dated = any(each.sky.mjd is not None for each in detections.values())
     for name, detection in detections.items():
         status = str(detection.provenance["status"])
+        frames = _frames(detection)
         reason = ""
         if status in _NOT_CALIBRATED:
             reason = f"its fit does not explain its data ({status}), so that its errors are wrong"
@@ -523,14 +526,24 @@ def _usable(
             reason = "its frames have no date, and others have"
         elif not np.isfinite(detection.error).any():
             reason = "it has no errors"
+        elif frames in shown:
+            reason = f"its frames are those of {shown[frames]}"
         if reason:
             left_out.append((name, reason))
             continue
+        if frames is not None:
+            shown[frames] = name
         each = SkyMap.of(detection, name)
         if each.star is None and star is not None:
             each = replace(each, star=float(star_flux_density(star, each.filter).value))
         maps.append(each)
     return tuple(maps), tuple(left_out)
+
+
+def _frames(detection: Detection) -> tuple[str | None, float, str] | None:
+    """Filter, date and first file of what was searched; None if the frames have no date."""
+    mjd, observation = detection.sky.mjd, detection.observation
+    return None if mjd is None else (observation.filter, mjd, observation.name)
 
 
 def _spectra(

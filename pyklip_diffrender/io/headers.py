@@ -124,6 +124,17 @@ def fits_text(text: object) -> str:
     return "".join(c if " " <= c <= "~" else "?" for c in letters)
 
 
+def file_name(label: str) -> str:
+    """Return a label as the name of a file or folder: letters, digits and .+-, 80 at most.
+
+    Examples
+    --------
+    >>> file_name("β Pic, F444W")
+    'Pic-F444W'
+    """
+    return re.sub(r"[^A-Za-z0-9.+-]+", "-", fits_text(label)).strip("-.")[:80]
+
+
 def card_error(name: str, card: str, value: Any, expected: str) -> CorruptFileError:
     """Error for a card that does not hold what is expected."""
     return CorruptFileError(

@@ -14,9 +14,12 @@ from pyklip_diffrender.reduction.products import (
 from pyklip_diffrender.reduction.reference_star import ReferenceStar
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
+    SPECTRA,
+    by_star,
     combined_rows,
     compare_reductions,
     in_words,
+    search_together,
     write_comparison,
 )
 from pyklip_diffrender.reduction.summary import summarise
@@ -25,6 +28,7 @@ from pyklip_diffrender.reduction.visit import Contribution, Visit
 __all__ = [
     "COMPARISON",
     "PRODUCTS",
+    "SPECTRA",
     "UNFINISHED",
     "Contribution",
     "Preparation",
@@ -33,12 +37,14 @@ __all__ = [
     "Reduction",
     "ReferenceStar",
     "Visit",
+    "by_star",
     "combined_rows",
     "compare_reductions",
     "existing_products",
     "in_words",
     "prepare",
     "reduce",
+    "search_together",
     "summarise",
     "write_comparison",
     "write_products",

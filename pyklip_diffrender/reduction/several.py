@@ -23,18 +23,26 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import Combination
+from pyklip_diffrender.detection import Combination, Detection, combine
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.reduction.pages import Picture, plus_minus, render, scientific
+from pyklip_diffrender.scene.exposure import CatalogueStar, star_of
 
 __all__ = [
     "COMPARISON",
+    "SPECTRA",
+    "by_star",
     "combined_rows",
     "compare_reductions",
     "in_words",
+    "search_together",
     "sources_of",
     "write_comparison",
 ]
+
+SPECTRA = ("blackbody", "flat", "free")
+"""Spectra of planets in searches over filters, unless others are asked for."""
 
 COMPARISON = ("comparison.html", "comparison.json")
 """Files that `write_comparison` writes."""
@@ -356,6 +364,75 @@ def _tracks(
             )
         )
     return pictures
+
+
+def by_star(detections: Mapping[str, Detection]) -> dict[str, dict[str, Detection]]:
+    """Group searches by their star.
+
+    Parameters
+    ----------
+    detections : mapping of str to Detection
+        By any name.
+
+    Returns
+    -------
+    dict of str to dict
+        The searches of each star, in the order and with the names of `detections`. Where two stars
+        have one name, it is numbered. Searches whose headers name no star are alone.
+    """
+    groups: list[dict[str, Detection]] = []
+    stars: list[CatalogueStar] = []
+    for name, each in detections.items():
+        star = star_of(each.observation.header, each.observation.name)
+        place = next((k for k, other in enumerate(stars) if star.is_same(other)), None)
+        if place is None:
+            stars.append(star)
+            groups.append({})
+        groups[-1 if place is None else place][name] = each
+    named: dict[str, dict[str, Detection]] = {}
+    for group in groups:
+        target = next(iter(group.values())).observation.target
+        name, number = target, 1
+        while name in named:
+            number += 1
+            name = f"{target} ({number})"
+        named[name] = group
+    return named
+
+
+def search_together(
+    reductions: Sequence[Any],
+    *,
+    spectra: Sequence[str] = SPECTRA,
+    star: str | None = None,
+    motion: tuple[float, float] | None = None,
+    parallax: float | None = None,
+) -> Combination | str:
+    """Search finished reductions of a star together, or say why that is not possible.
+
+    The reductions are worth more than a search that cannot be made of them, so that what is wrong
+    with it is no error here.
+
+    Parameters
+    ----------
+    reductions : sequence of Reduction, Detection or path
+        As for `combine`, as the other arguments are.
+    spectra : sequence of str
+    star : str, optional
+    motion : (2,), optional
+    parallax : float, optional
+
+    Returns
+    -------
+    Combination or str
+        The message of the error, if there was one.
+    """
+    try:
+        return combine(
+            reductions, spectra=spectra, star=star, proper_motion=motion, parallax=parallax
+        )
+    except (CorruptFileError, IncompatibleSetupError) as error:
+        return str(error)
 
 
 def combined_rows(combined: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:

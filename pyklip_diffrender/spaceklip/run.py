@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+from collections import abc
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +23,11 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
 )
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
+from pyklip_diffrender.io.headers import file_name
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
 from pyklip_diffrender.pyklip_backend.dataset_frames import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
+from pyklip_diffrender.reduction import SPECTRA, by_star, in_words, search_together
 from pyklip_diffrender.refinement import to_jansky
 from pyklip_diffrender.scene.admission import FrameFile
 from pyklip_diffrender.scene.sequence import Sequence
@@ -68,6 +71,7 @@ def run_obs(
     save_rolls: bool = False,
     star_flux: Mapping[str, float | str | u.Quantity] | None = None,
     star_flux_error: float = ReduceOptions.star_flux_error,
+    spectra: abc.Sequence[str] = SPECTRA,
     verbose: bool = False,
     **settings: Any,
 ) -> dict[str, Detection]:
@@ -91,6 +95,10 @@ def run_obs(
     ``<concatenation>.dat`` is its table, and ``<concatenation>_psfmask.fits`` the transmission of
     the mask, if the table names the rolls' mask files.
 
+    Concatenations of one target, of several filters or epochs, are then searched together as
+    `pyklip_diffrender.combine` does, and the folder ``combined_<target>`` has the files of
+    `pyklip_diffrender.Combination.write`.
+
     Parameters
     ----------
     database : spaceKLIP.database.Database
@@ -113,6 +121,8 @@ def run_obs(
         light determines it. The subtracted images hardly change.
     star_flux_error : float
         Relative error of these, with that of the photometric calibration.
+    spectra : sequence of str
+        Spectra of planets for the search over concatenations; see `pyklip_diffrender.combine`.
     verbose : bool
         Print what is being done.
     **settings
@@ -134,7 +144,9 @@ def run_obs(
     Warns
     -----
     DiffrenderWarning
-        For every concatenation that is skipped, and every file that is left out, with the reason.
+        For every concatenation that is skipped or left out of the search of a target, for every
+        target whose concatenations cannot be searched together, and for every file that is left
+        out, with the reason.
 
     Examples
     --------
@@ -191,10 +203,41 @@ def run_obs(
         database.read_jwst_s3_data([str(products[key]) for key in detections])
         for key, detection in detections.items():
             _store(database, products[key], source_table(detection, products[key]))
+        _search_together(detections, folder, spectra)
     if failures:
         tried = len(failures) + len(detections)
         raise ExceptionGroup(f"{len(failures)} of {tried} concatenations failed", failures)
     return detections
+
+
+def _search_together(
+    detections: Mapping[str, Detection], folder: Path, spectra: abc.Sequence[str]
+) -> None:
+    """Search the concatenations of every target that has several, and write what is found.
+
+    Warns
+    -----
+    DiffrenderWarning
+        For what is not searched.
+    """
+    if len(detections) < 2:
+        return
+    for target, group in by_star(detections).items():
+        if len(group) < 2:
+            continue
+        found = search_together(list(group.values()), spectra=spectra)
+        if isinstance(found, str):
+            warnings.warn(
+                f"{target} has no combined search: {found}", DiffrenderWarning, stacklevel=3
+            )
+            continue
+        found.write(folder / f"combined_{file_name(target)}", overwrite=True)
+        logger.info("%s: %s", target, in_words(found))
+        for name, reason in found.left_out:
+            warnings.warn(
+                f"{target}: {name} is left out of the combined search: {reason}",
+                DiffrenderWarning, stacklevel=3,
+            )  # fmt: skip
 
 
 def _filter(table: Table) -> str:

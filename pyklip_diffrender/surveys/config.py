@@ -178,6 +178,9 @@ _PIXEL = 0.063
 
 _MEMORY = re.compile(r"\d+(\.\d+)? ?([kMGT]i?)?B")
 
+_SPECTRA = ("blackbody", "flat", "free")
+"""Names of spectra that `combine` knows."""
+
 _SETTINGS = (
     "free", "own", "wavefront", "cycles", "grow_basis", "coarse_first", "deviations",
     "drift_cycles", "max_companions", "companion_threshold", "companions_if_stalled",
@@ -266,11 +269,15 @@ class Config:
         Processes; None for one per core, 0 for this process alone.
     memory_limit : str or None
         Of each worker, such as "4 GB"; None for an equal share of the machine's.
+    spectra : tuple of str
+        Spectra of planets for the search over the filters of a star, see `combine`; empty for its
+        defaults.
     """
 
     sequences: tuple[SequenceConfig, ...]
     workers: int | None = None
     memory_limit: str | None = None
+    spectra: tuple[str, ...] = ()
 
 
 def read_config(source: str | os.PathLike[str] | Mapping[str, Any]) -> Config:
@@ -320,6 +327,12 @@ def _config(top: CheckedTable) -> Config:
     options = _options(shared, Options())
     shared.finish()
     injections = _injections(top.table("injections"), Injections())
+    together = top.table("combined")
+    spectra = together.take(
+        "spectra", (), f"a list of {', '.join(map(repr, _SPECTRA))} or existing tables",
+        only(list_of(lambda each: each if each in _SPECTRA else str(top.existing(each))), bool),
+    )  # fmt: skip
+    together.finish()
     listed = top.take("sequence", [], "one or more tables [[sequence]]", as_list)
     sequences: list[SequenceConfig] = []
     for k, each in enumerate(listed, 1):
@@ -333,7 +346,7 @@ def _config(top: CheckedTable) -> Config:
     top.finish()
     if not listed and not top.problems:
         top.complain("sequence", "none", "one or more tables [[sequence]] with files and opd")
-    return Config(tuple(sequences), workers, memory)
+    return Config(tuple(sequences), workers, memory, spectra)
 
 
 def _sequence(

@@ -6,7 +6,6 @@ import hashlib
 import json
 import logging
 import os
-import re
 import secrets
 import shutil
 import socket
@@ -20,7 +19,7 @@ from typing import Any
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import fits_files, read_text, sha256
-from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.io.headers import file_name
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
 from pyklip_diffrender.wavefront.opd import wavefront_for
@@ -33,6 +32,8 @@ __all__ = [
     "clean",
     "encodable",
     "finished",
+    "folder_of",
+    "hash_of",
     "jobs_of",
     "prepare",
     "publish",
@@ -88,12 +89,12 @@ class Job:
     @property
     def folder(self) -> str:
         """Name of the folder with its products: what the job is, and the beginning of the key."""
-        return _folder(str(self), self.key)
+        return folder_of(str(self), self.key)
 
     @property
     def base_folder(self) -> str | None:
         """The same of the job whose fit an injection starts from."""
-        return None if self.base is None else _folder(self.name, self.base)
+        return None if self.base is None else folder_of(self.name, self.base)
 
     def __str__(self) -> str:
         planet = self.injection
@@ -206,7 +207,7 @@ def _job(
         **({} if epoch is None else {"epoch": epoch}),
     }
     return Job(
-        _hash(facts),
+        hash_of(facts),
         sequence.name if epoch is None else f"{sequence.name} {epoch[:10]}",
         tuple(map(str, files)),
         str(opd),
@@ -219,16 +220,17 @@ def _job(
 
 
 def _with_planet(base: Job, planet: Injection) -> Job:
-    key = _hash({"base": base.key, "planet": [planet.contrast, planet.separation, planet.angle]})
+    key = hash_of({"base": base.key, "planet": [planet.contrast, planet.separation, planet.angle]})
     return replace(base, key=key, injection=planet, base=base.key)
 
 
-def _folder(label: str, key: str) -> str:
-    readable = re.sub(r"[^A-Za-z0-9.+-]+", "-", fits_text(label)).strip("-.")[:80]
-    return f"{readable}_{key[:_DIGITS]}"
+def folder_of(label: str, key: str) -> str:
+    """Name of a folder: what is in it, and the beginning of its key."""
+    return f"{file_name(label)}_{key[:_DIGITS]}"
 
 
-def _hash(facts: Mapping[str, Any]) -> str:
+def hash_of(facts: Mapping[str, Any]) -> str:
+    """SHA-256 of plain values."""
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 

@@ -15,8 +15,17 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
-from pyklip_diffrender.reduction.pages import Picture, count, number, render, scientific
+from pyklip_diffrender.reduction import COMPARISON
+from pyklip_diffrender.reduction.pages import (
+    Picture,
+    count,
+    number,
+    plus_minus,
+    render,
+    scientific,
+)
 from pyklip_diffrender.surveys.jobs import Injection, Job, Record
+from pyklip_diffrender.surveys.stars import StarSearch
 
 __all__ = ["COLUMNS", "page", "row", "table_of", "write_tables"]
 
@@ -158,8 +167,8 @@ _NAMES = 3
 """Most sequences that the title names."""
 
 
-def page(rows: Rows) -> str:
-    """The page of jobs with their records, None for one that waits."""
+def page(rows: Rows, stars: Sequence[StarSearch] = ()) -> str:
+    """The page of jobs with records (None for one that waits), and of the combined searches."""
     states = [_status(record) for _, record in rows]
     done, failed, waiting = map(states.count, ("finished", "failed", "waiting"))
     parts = [f"{done} of {count(len(rows), 'job')} finished"]
@@ -196,6 +205,7 @@ def page(rows: Rows) -> str:
             for job, record in _finished(rows)
             for each in record["result"].get("candidates", ())
         ],
+        stars=[line for each in stars for line in _star(each)],
         any_injected=any(job.injection for job, _ in rows),
         injections=_injections(rows),
         jobs=[_job(job, record) for job, record in rows],
@@ -295,6 +305,33 @@ def _limits(rows: Rows) -> tuple[list[float], list[tuple[str, dict[float, float]
 def _array(result: dict[str, Any], key: str) -> NDArray[np.float64]:
     """A column of the contrast curve, NaN where it is not known."""
     return np.array(result["curve"][key], dtype=float)
+
+
+def _star(search: StarSearch) -> list[dict[str, str]]:
+    """Rows about the search of a star: one for each candidate, or one that says that none is."""
+    about = {
+        "star": search.star,
+        "page": f"{search.folder}/{COMPARISON[0]}",
+        "jobs": ", ".join(search.jobs),
+        **dict.fromkeys(("separation", "angle", "snr", "false_alarm"), ""),
+    }
+    if "reason" in search.combined:
+        return [{**about, "result": f"no combined search: {search.combined['reason']}"}]
+    left_out = "".join(
+        f" Left out: {each['name']}: {each['reason']}." for each in search.combined["left_out"]
+    )
+    found = [
+        {
+            "result": f"candidate with the spectrum {each['spectrum']}"
+            + (f", {each['verdict']}" if "verdict" in each else "") + f".{left_out}",
+            "separation": plus_minus(each["separation_arcsec"], each["separation_error_arcsec"]),
+            "angle": plus_minus(each["position_angle_deg"], each["position_angle_error_deg"]),
+            "snr": f"{each['snr']:.1f}",
+            "false_alarm": scientific(each["false_alarm_probability"]),
+        }
+        for each in search.combined["candidates"]
+    ]  # fmt: skip
+    return [{**about, **each} for each in found or [{"result": f"no candidate.{left_out}"}]]
 
 
 def _injections(rows: Rows) -> list[tuple[Job, Injection, Record]]:
