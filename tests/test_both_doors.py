@@ -107,8 +107,8 @@ def light() -> Callable[[float, tuple[float, float]], np.ndarray]:
     return image
 
 
-def written(folder: Path, light: Any, *, aligned: bool) -> list[Path]:
-    """Write two rolls of two integrations, as the pipeline or spaceKLIP does."""
+def written(folder: Path, light: Any, *, aligned: bool, integrations: int = 2) -> list[Path]:
+    """Write two rolls of some integrations, as the pipeline or spaceKLIP does."""
     paths = []
     for k, (roll, center) in enumerate(ROLLS, 1):
         cards = {
@@ -117,7 +117,8 @@ def written(folder: Path, light: Any, *, aligned: bool) -> list[Path]:
         }  # fmt: skip
         path = calints(
             folder / f"jw01184{k:03d}001_03106_00001_nrcalong_calints.fits",
-            observation=k, roll=roll, integrations=2, light=light(roll, center), cards=cards,
+            observation=k, roll=roll, integrations=integrations, cards=cards,
+            light=light(roll, center),
         )  # fmt: skip
         with fits.open(path, mode="update") as hdus:
             science = hdus["SCI"].header
@@ -129,13 +130,15 @@ def written(folder: Path, light: Any, *, aligned: bool) -> list[Path]:
                 middle = np.array([SIDE - 1, SIDE - 1]) / 2
                 shift = middle - center
                 for name in ("SCI", "ERR"):
-                    moved = shift_frames(hdus[name].data.astype(float), np.tile(shift, (2, 1)))
+                    moved = shift_frames(
+                        hdus[name].data.astype(float), np.tile(shift, (integrations, 1))
+                    )
                     hdus[name].data = moved.astype(np.float32)
                 for key, value in zip(("1", "2"), middle, strict=True):
                     science[f"CRPIX{key}"] = value + 1
                 science["STARCENX"], science["STARCENY"] = middle + 1
-                hdus.append(fits.ImageHDU(np.tile(shift, (2, 1)), name="IMSHIFTS"))
-                hdus.append(fits.ImageHDU(np.zeros((2, 2)), name="MASKOFFS"))
+                hdus.append(fits.ImageHDU(np.tile(shift, (integrations, 1)), name="IMSHIFTS"))
+                hdus.append(fits.ImageHDU(np.zeros((integrations, 2)), name="MASKOFFS"))
         paths.append(path)
     return paths
 
@@ -400,3 +403,27 @@ def test_every_door_gives_one_answer(
     monkeypatch.setattr(fitting, "fit_in_stages", fitted)
     assert_same(answers[aligned], door(files, out))
     assert made == {"Detection": 1, "fit_in_stages": 1}
+
+
+@pytest.mark.slow
+def test_a_fit_does_not_depend_on_how_an_exposure_was_cut_into_files(
+    light: Any, tmp_path: Path
+) -> None:
+    """Segments are no rolls, from whose differences a pattern might be learned."""
+    (whole, _) = written(tmp_path, light, aligned=False, integrations=4)
+    parts = []
+    for k in (0, 1):
+        parts.append(tmp_path / f"{whole.name[:25]}-seg00{k + 1}_nrcalong_calints.fits")
+        with fits.open(whole) as hdus:
+            for name in ("SCI", "ERR", "DQ"):
+                hdus[name].data = hdus[name].data[2 * k : 2 * k + 2]
+            hdus[0].header["EXSEGNUM"] = k + 1
+            hdus.writeto(parts[k])
+    one, two = (through_reduce(files, tmp_path) for files in ([whole], parts))
+    assert [len(each.fit.frames) for each in (one, two)] == [1, 1]
+    assert [each.fit.frames[0].observation.count for each in (one, two)] == [4, 4]
+    assert (one.fit.status, one.pattern) == (two.fit.status, two.pattern)
+    # The means of segments are weighted by errors that are measured in each.
+    assert two.fit.chi2_per_pixel == pytest.approx(one.fit.chi2_per_pixel, rel=1e-3)
+    limits = [np.asarray(each.detection.contrast_curve["contrast"]) for each in (one, two)]
+    np.testing.assert_allclose(limits[1], limits[0], rtol=0.01)

@@ -93,8 +93,8 @@ class FrameFile:
     place : tuple of float or None
         x, y of the star in the file, 0-indexed pixels, which replaces that of the header.
     frames : Observation or DiffrenderError, optional
-        Its frames, one for every integration, or why they cannot be read; None for a file that is
-        read when its frames are needed.
+        The mean of the integrations of each pointing, or why they cannot be read; None for a file
+        that is read when its frames are needed.
     observation : Observation or None
         The mean of the integrations of each pointing that are used, once they were read.
     """
@@ -111,7 +111,7 @@ class FrameFile:
 
     @classmethod
     def in_hdus(cls, hdus: fits.HDUList, path: Path, *, frames: bool) -> FrameFile:
-        """Read the header of an open file, and its frames if they are asked for."""
+        """Read the header of an open file, and the means of its frames if they are asked for."""
         product = _why_a_product(hdus)
         if product:
             return cls(path, Exposure(path.name), reason=product, is_product=True)
@@ -124,14 +124,14 @@ class FrameFile:
             file = cls(path, Exposure(path.name), reason=_without_name(error, path.name))
         if frames:
             try:
-                file.frames = Observation.from_hdus(hdus, path)
+                file.frames = Observation.means_from_hdus(hdus, path)
             except DiffrenderError as error:
                 file.frames = error
         return file
 
     @classmethod
     def opened(cls, path: Path, *, frames: bool) -> FrameFile:
-        """Open a file once, and read its header, and its frames if they are asked for."""
+        """Open a file once; read its header, and the means of its frames if they are asked for."""
         try:
             with open_fits(path, images=False) as hdus:
                 return cls.in_hdus(hdus, path, frames=frames)
@@ -158,7 +158,7 @@ class FrameFile:
             raise self.frames
         if self.frames is None:
             return Observation.means_from_fits(self.path, star=self.place)
-        return self.frames.means()
+        return self.frames
 
 
 def _without_name(error: Exception, name: str) -> str:
