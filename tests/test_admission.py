@@ -665,12 +665,12 @@ def test_a_neighbour_is_not_taken_for_the_star(
 
 
 def field_stars(hdus: fits.HDUList) -> None:
-    """300 stars anywhere, up to as bright as the star behind the mask."""
+    """300 stars anywhere, with peaks up to ten times as bright as the star behind the mask."""
     data, rng = hdus["SCI"].data, np.random.default_rng(11)
     ny, nx = data.shape[1:]
     light = np.zeros((ny, nx))
     for x, y in rng.uniform(0, 1, (300, 2)) * (nx, ny):
-        light[int(y), int(x)] += 10 ** rng.uniform(-3, 0)
+        light[int(y), int(x)] += 10 ** rng.uniform(-3, 1)
     light *= np.nanmax(data) * 2 * np.pi * 1.1**2
     data += gaussian_filter(light, 1.1).astype(data.dtype)
 
@@ -687,8 +687,13 @@ def edge_on_disk(hdus: fits.HDUList) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [lambda hdus: neighbour(1e-3, 1.5, 130.0, size=0.25)(hdus), field_stars, edge_on_disk],
-    ids=["galaxy", "300 field stars", "disk of AU Mic"],
+    [
+        lambda hdus: neighbour(1e-3, 1.5, 130.0, size=0.25)(hdus),
+        lambda hdus: neighbour(1e-2, 1.5, 130.0, size=0.25)(hdus),
+        field_stars,
+        edge_on_disk,
+    ],
+    ids=["galaxy", "bright galaxy", "300 field stars", "disk of AU Mic"],
 )
 def test_a_star_is_admitted_beside_extended_light_and_many_stars(
     shared_data: Path, tmp_path: Path, change: Any
