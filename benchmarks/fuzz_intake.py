@@ -34,6 +34,7 @@ from benchmarks.intake_mutations import MUTATIONS, Folder
 from benchmarks.provenance import provenance
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.files import write_table
+from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["check", "make_frames", "run"]
@@ -206,7 +207,12 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
         faults += [f"{name}: {f}" for f in _differences(each, twin[source], several, lit=lit)]
     faults += [f"{source} is used {n} times" for source, n in used.items() if n > 1]
     reasons = dict(sequence.excluded)
-    lone = any(_source(each.name) in folder.other for each in sequence.science)
+    # Beside frames that do not state their set-up, others cannot be used.
+    lone = any(
+        _source(each.name) in folder.other
+        or None in Exposure.of(each.header, each.name, each.data.shape).setup
+        for each in sequence.science
+    )
     for name, source in folder.sources.items():
         untouched = not lone and name not in folder.bad | folder.doubtful
         if untouched and name == source and not used[source]:

@@ -799,6 +799,17 @@ def test_a_copy_of_an_exposure_that_can_be_used_stands_in_for_it(folder: Path) -
     assert "ERR" in reasons(sequence)[FIRST]
 
 
+def test_frames_that_do_not_state_their_mask_are_no_measure_for_others(folder: Path) -> None:
+    (folder / SECOND).unlink()
+    path = folder / FIRST
+    for key in ("CORONMSK", "APERNAME", "SUBARRAY"):
+        fits.delval(path, key)
+    sequence = dr.Sequence.from_files(folder)
+    assert uses(sequence)[FIRST] == "target"
+    (reason,) = reasons(sequence).values()
+    assert "mask is MASK335R, which they do not state; add the card" in reason
+
+
 # -- segments and binaries -------------------------------------------------------------------------
 
 

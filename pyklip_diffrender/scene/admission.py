@@ -557,7 +557,9 @@ def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[Fram
     names = ("INSTRUME", "DETECTOR", "mask", "PUPIL", "FILTER", "BUNIT")
     for each in (*science, *references):
         different = [
-            f"{name} is {own or 'not stated'}, not {other}"
+            f"{name} is {own}, which they do not state; add the card"
+            if other is None
+            else f"{name} is {own or 'not stated'}, not {other}"
             for name, own, other in zip(names, each.exposure.setup, majority, strict=True)
             if own != other
         ]
