@@ -26,16 +26,22 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
+from astropy.table import Table
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints, starlight
 from benchmarks.intake_mutations import MUTATIONS, Folder
+from benchmarks.provenance import provenance
 from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.io.files import write_table
+from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["check", "make_frames", "run"]
 
 _CYCLES, _SIZE = 6, 40
+
+_OUTCOMES = ("as untouched", "excluded", "refused", "wrongly refused", "wrong", "crash")
 
 _SAME_LIMIT = 1.25
 """Ratio of limits of a fit and of the untouched fit: fewer frames of the target are allowed for."""
@@ -201,7 +207,12 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
         faults += [f"{name}: {f}" for f in _differences(each, twin[source], several, lit=lit)]
     faults += [f"{source} is used {n} times" for source, n in used.items() if n > 1]
     reasons = dict(sequence.excluded)
-    lone = any(_source(each.name) in folder.other for each in sequence.science)
+    # Beside frames that do not state their set-up, others cannot be used.
+    lone = any(
+        _source(each.name) in folder.other
+        or None in Exposure.of(each.header, each.name, each.data.shape).setup
+        for each in sequence.science
+    )
     for name, source in folder.sources.items():
         untouched = not lone and name not in folder.bad | folder.doubtful
         if untouched and name == source and not used[source]:
@@ -266,20 +277,15 @@ def _fit(sequence: dr.Sequence) -> np.ndarray:
     return np.interp([0.5, 0.8, 1.1], curve["separation"].to_value("arcsec"), curve["contrast"])
 
 
-def _table(records: list[dict[str, Any]]) -> str:
-    outcomes = ("as untouched", "excluded", "refused", "wrongly refused", "wrong", "crash")
-    counts = {kind: Counter[str]() for kind in sorted(MUTATIONS)}
-    for record in records:
-        for kind in record["mutations"]:
-            counts[kind][record["outcome"]] += 1
-    lines = [f"{'mutation':62s}" + "".join(f"{each:>16s}" for each in outcomes)]
-    lines += [
-        f"{kind:62s}" + "".join(f"{count[each]:16d}" for each in outcomes)
-        for kind, count in counts.items()
-    ]
+def _counts(records: list[dict[str, Any]]) -> Table:
+    """How often each kind of mutation, alone or with others, came out how."""
+    table = Table(names=("mutation", *_OUTCOMES), dtype=("U64", *(int for _ in _OUTCOMES)))
+    for kind in sorted(MUTATIONS):
+        count = Counter(r["outcome"] for r in records if kind in r["mutations"])
+        table.add_row((kind, *(count[each] for each in _OUTCOMES)))
     total = Counter(record["outcome"] for record in records)
-    lines.append(f"{f'{len(records)} folders':62s}" + "".join(f"{total[e]:16d}" for e in outcomes))
-    return "\n".join(lines)
+    table.add_row((f"all {len(records)} folders", *(total[each] for each in _OUTCOMES)))
+    return table
 
 
 def main() -> None:
@@ -290,13 +296,21 @@ def main() -> None:
     parser.add_argument("--fits", type=int, default=0, help="folders to fit")
     parser.add_argument("--frames", type=Path, help="folder of real frames of programme 1184")
     parser.add_argument("--output", type=Path, help="JSON lines, from which a run goes on")
+    parser.add_argument("--table", type=Path, help="for the counts by kind, ECSV")
     options = parser.parse_args()
     logging.getLogger("pyklip_diffrender").setLevel(logging.ERROR)
     with tempfile.TemporaryDirectory() as place:
         frames = make_frames(Path(place) / "untouched", options.frames)
         seeds = range(options.first, options.first + options.count)
         records = run(frames, seeds, options.output, options.fits)
-    print(_table(records))
+    table = _counts(records)
+    table.pprint_all()
+    if options.table is not None:
+        command = f"python -m benchmarks.fuzz_intake --count {options.count}"
+        if options.frames is not None:
+            command += " --frames FRAMES"
+        table.meta = {"provenance": provenance(command)}
+        write_table(table, options.table)
     for record in records:
         if record["outcome"] in ("wrong", "wrongly refused", "crash"):
             print(record)

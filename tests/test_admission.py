@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
+from scipy.ndimage import gaussian_filter
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints, starlight
@@ -523,8 +524,11 @@ def test_every_integration_can_keep_its_place(tmp_path):
     assert every.remarks == used.remarks
 
 
-def neighbour(contrast, separation, angle):
-    """Add a source next to the star, by the image of the coronagraph's model, to real frames."""
+def neighbour(contrast, separation, angle, size=0.0):
+    """Add a source next to the star, by the image of the coronagraph's model, to real frames.
+
+    An extended one has the `size`, in arcsec, as its standard deviation.
+    """
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 
     model = nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=256, fov_pixels=161)
@@ -533,6 +537,9 @@ def neighbour(contrast, separation, angle):
     star, source = (
         model(opd, tuple(offset)).double().detach().numpy() for offset in ((0.0, 0.0), place)
     )
+
+    if size:
+        source = gaussian_filter(source, size / 0.063)
 
     def change(hdus):
         header, data = hdus["SCI"].header, hdus["SCI"].data
@@ -568,6 +575,42 @@ def real_roll(shared_data, path, change):
 def test_a_neighbour_is_not_taken_for_the_star(shared_data, tmp_path, contrast, separation, angle):
     path = real_roll(shared_data, tmp_path / "a.fits", neighbour(contrast, separation, angle))
     (frame,) = dr.Sequence.from_files(path).science
+    assert frame.first_pixel == (490, 1500)
+
+
+def field_stars(hdus):
+    """300 stars anywhere, with peaks up to ten times as bright as the star behind the mask."""
+    data, rng = hdus["SCI"].data, np.random.default_rng(11)
+    ny, nx = data.shape[1:]
+    light = np.zeros((ny, nx))
+    for x, y in rng.uniform(0, 1, (300, 2)) * (nx, ny):
+        light[int(y), int(x)] += 10 ** rng.uniform(-3, 1)
+    light *= np.nanmax(data) * 2 * np.pi * 1.1**2
+    data += gaussian_filter(light, 1.1).astype(data.dtype)
+
+
+def edge_on_disk(hdus):
+    """As bright as AU Mic's: beside G 7-34 it has 0.6 MJy/sr at 1 arcsec, and 0.36 at 2."""
+    data, header = hdus["SCI"].data, hdus["SCI"].header
+    rows, columns = np.indices(data.shape[1:])
+    x, y = ((k - (header[key] - 1)) * 0.063 for k, key in ((columns, "CRPIX1"), (rows, "CRPIX2")))
+    along, across = 0.6 * x + 0.8 * y, 0.8 * x - 0.6 * y
+    light = 0.6 * np.maximum(np.abs(along), 0.3) ** -0.75 * np.exp(-((across / 0.12) ** 2) / 2)
+    data += np.where(np.hypot(x, y) > 0.3, light, 0.0).astype(data.dtype)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda hdus: neighbour(1e-3, 1.5, 130.0, size=0.25)(hdus),
+        lambda hdus: neighbour(1e-2, 1.5, 130.0, size=0.25)(hdus),
+        field_stars,
+        edge_on_disk,
+    ],
+    ids=["galaxy", "bright galaxy", "300 field stars", "disk of AU Mic"],
+)
+def test_a_star_is_admitted_beside_extended_light_and_many_stars(shared_data, tmp_path, change):
+    (frame,) = dr.Sequence.from_files(real_roll(shared_data, tmp_path / "a.fits", change)).science
     assert frame.first_pixel == (490, 1500)
 
 
@@ -650,6 +693,17 @@ def test_files_that_cannot_be_used_do_not_vote(folder, spoil, count, cards):
     assert as_before(sequence, folder)
     assert sorted(reasons(sequence)) == names
     assert all(reasons(sequence).values())
+
+
+def test_frames_that_do_not_state_their_mask_are_no_measure_for_others(folder):
+    (folder / SECOND).unlink()
+    path = folder / FIRST
+    for key in ("CORONMSK", "APERNAME", "SUBARRAY"):
+        fits.delval(path, key)
+    sequence = dr.Sequence.from_files(folder)
+    assert uses(sequence)[FIRST] == "target"
+    (reason,) = reasons(sequence).values()
+    assert "mask is MASK335R, which they do not state; add the card" in reason
 
 
 def test_segments_of_an_exposure_are_one_roll(folder):

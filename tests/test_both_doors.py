@@ -104,8 +104,8 @@ def light():
     return image
 
 
-def written(folder, light, *, aligned):
-    """Write two rolls of two integrations, as the pipeline or spaceKLIP does."""
+def written(folder, light, *, aligned, integrations=2):
+    """Write two rolls of some integrations, as the pipeline or spaceKLIP does."""
     paths = []
     for k, (roll, center) in enumerate(ROLLS, 1):
         cards = {
@@ -114,7 +114,8 @@ def written(folder, light, *, aligned):
         }  # fmt: skip
         path = calints(
             folder / f"jw01184{k:03d}001_03106_00001_nrcalong_calints.fits",
-            observation=k, roll=roll, integrations=2, light=light(roll, center), cards=cards,
+            observation=k, roll=roll, integrations=integrations, cards=cards,
+            light=light(roll, center),
         )  # fmt: skip
         with fits.open(path, mode="update") as hdus:
             science = hdus["SCI"].header
@@ -126,13 +127,15 @@ def written(folder, light, *, aligned):
                 middle = np.array([SIDE - 1, SIDE - 1]) / 2
                 shift = middle - center
                 for name in ("SCI", "ERR"):
-                    moved = shift_frames(hdus[name].data.astype(float), np.tile(shift, (2, 1)))
+                    moved = shift_frames(
+                        hdus[name].data.astype(float), np.tile(shift, (integrations, 1))
+                    )
                     hdus[name].data = moved.astype(np.float32)
                 for key, value in zip(("1", "2"), middle, strict=True):
                     science[f"CRPIX{key}"] = value + 1
                 science["STARCENX"], science["STARCENY"] = middle + 1
-                hdus.append(fits.ImageHDU(np.tile(shift, (2, 1)), name="IMSHIFTS"))
-                hdus.append(fits.ImageHDU(np.zeros((2, 2)), name="MASKOFFS"))
+                hdus.append(fits.ImageHDU(np.tile(shift, (integrations, 1)), name="IMSHIFTS"))
+                hdus.append(fits.ImageHDU(np.zeros((integrations, 2)), name="MASKOFFS"))
         paths.append(path)
     return paths
 
@@ -312,9 +315,8 @@ def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, c
 )
 @pytest.mark.parametrize("exposure", ["03106", "03107"], ids=["F444W", "F356W"])
 def test_real_pairs_are_the_same_in_both_doors(
-    exposure, visits, shared_data, tmp_path, calls,
-    monkeypatch,
-):  # fmt: skip
+    exposure, visits, shared_data, tmp_path, calls, monkeypatch
+):
     """The frames, the map and the pattern of the library, without a fit."""
     monkeypatch.setattr("pyklip_diffrender.pattern.choice.package_library", package_library)
     folder = shared_data / "gto1184"
@@ -367,10 +369,7 @@ def counting(function, calls, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("aligned", [False, True], ids=["unaligned", "aligned"])
 @DOORS
-def test_every_door_gives_one_answer(
-    door, aligned, light, tmp_path, answers,
-    monkeypatch,
-):  # fmt: skip
+def test_every_door_gives_one_answer(door, aligned, light, tmp_path, answers, monkeypatch):
     files = written(tmp_path, light, aligned=aligned)
     if aligned not in answers:
         answers[aligned] = through_reduce(files, tmp_path)
@@ -392,3 +391,25 @@ def test_every_door_gives_one_answer(
     monkeypatch.setattr(fitting, "fit_in_stages", fitted)
     assert_same(answers[aligned], door(files, out))
     assert made == {"Detection": 1, "fit_in_stages": 1}
+
+
+@pytest.mark.slow
+def test_a_fit_does_not_depend_on_how_an_exposure_was_cut_into_files(light, tmp_path):
+    """Segments are no rolls, from whose differences a pattern might be learned."""
+    (whole, _) = written(tmp_path, light, aligned=False, integrations=4)
+    parts = []
+    for k in (0, 1):
+        parts.append(tmp_path / f"{whole.name[:25]}-seg00{k + 1}_nrcalong_calints.fits")
+        with fits.open(whole) as hdus:
+            for name in ("SCI", "ERR", "DQ"):
+                hdus[name].data = hdus[name].data[2 * k : 2 * k + 2]
+            hdus[0].header["EXSEGNUM"] = k + 1
+            hdus.writeto(parts[k])
+    one, two = (through_reduce(files, tmp_path) for files in ([whole], parts))
+    assert [len(each.fit.frames) for each in (one, two)] == [1, 1]
+    assert [each.fit.frames[0].observation.count for each in (one, two)] == [4, 4]
+    assert (one.fit.status, one.pattern) == (two.fit.status, two.pattern)
+    # The means of segments are weighted by errors that are measured in each.
+    assert two.fit.chi2_per_pixel == pytest.approx(one.fit.chi2_per_pixel, rel=1e-3)
+    limits = [np.asarray(each.detection.contrast_curve["contrast"]) for each in (one, two)]
+    np.testing.assert_allclose(limits[1], limits[0], rtol=0.01)

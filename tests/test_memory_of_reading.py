@@ -12,6 +12,7 @@ from astropy.io import fits
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints
+from pyklip_diffrender.errors import DiffrenderWarning
 from pyklip_diffrender.io import files
 from pyklip_diffrender.scene import integrations
 from pyklip_diffrender.scene.observation import Observation
@@ -111,3 +112,47 @@ def test_a_sequence_counts_the_integrations_of_its_means(tmp_path):
     assert sequence.science[0].cutout(40).combined().count == MANY - 2
     (row,) = sequence.table
     assert row["integrations"] == MANY - 2
+
+
+def test_pyklip_datasets_take_about_twice_their_file(tmp_path, monkeypatch):
+    """What pyKLIP holds itself included: its frames take a third of the file."""
+    JWST = pytest.importorskip("pyklip.instruments.JWST")
+    from pyklip_diffrender.pyklip_backend import dataset_frames
+
+    def offline(**options):
+        raise OSError("offline")
+
+    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", offline)
+    monkeypatch.setattr(integrations, "_AT_ONCE", 2**16)
+    paths = [plain(tmp_path), calints(tmp_path / "warm.fits")]
+    for path in paths:
+        fits.setval(path, "CRVAL1", value=100.0, extname="SCI")
+        fits.setval(path, "CRVAL2", value=20.0, extname="SCI")
+    size, datasets = 12 * MANY * SIDE**2, []
+
+    def read(path):
+        datasets.append(JWST.JWSTData([str(path)]))
+
+    def gathered():
+        dataset = datasets[-1]
+        settings = dr.DiffrenderSettings()
+        return dataset_frames.frames_of(dataset, np.arange(MANY), dataset.input, settings)
+
+    dr.register(opd="flat")
+    try:
+        read(paths[1])  # What is imported and cached stays.
+        assert peak(lambda: read(paths[0])) < 2.2 * size
+        with pytest.warns(DiffrenderWarning, match="left out"):
+            assert peak(gathered) < 2.5 * size
+    finally:
+        dr.unregister()
+    source = getattr(datasets[-1], dataset_frames.ATTRIBUTE)
+    assert source.data.dtype == np.float32
+    # A dataset keeps the means that a sequence has.
+    (file,) = source.files.values()
+    means = Observation.means_from_fits(paths[0])
+    for name in ("data", "error", "valid", "center"):
+        np.testing.assert_array_equal(getattr(file.frames, name), getattr(means, name))
+    assert file.frames.integrations == means.integrations == (MANY - 2,)
+    assert file.frames.noise_ratios == pytest.approx(means.noise_ratios)
+    assert file.frames.remarks == means.remarks

@@ -301,6 +301,18 @@ def test_a_refinement_survives_the_file(tmp_path):
     np.testing.assert_array_equal(again["contrast_error"], first["contrast_error"])
 
 
+def test_a_file_says_of_how_many_integrations_frames_are_the_mean(tmp_path):
+    fit = rolled_fit()
+    one, two = fit.frames
+    frames = (
+        replace(one, observation=replace(one.observation, integrations=(7,))),
+        # Two segments of an exposure, which the file has as one mean.
+        replace(two, observation=two.observation.followed_by([two.observation] * 2)),
+    )
+    back = Refinement.read(replace(fit, frames=frames).write(tmp_path / "fit.fits", linear=False))
+    assert [each.observation.count for each in back.frames] == [7, 3]
+
+
 def test_reduce_says_what_systematics_it_takes():
     sequence = Sequence("TARGET", (frame("TARGET", 20),))
     with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'references'"):

@@ -25,21 +25,27 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import (
     CorruptFileError,
+    DiffrenderError,
     DiffrenderWarning,
     IncompatibleSetupError,
     NoValidPixelsError,
     ShapeError,
 )
 from pyklip_diffrender.instrument.masks import FILTERS, detector_place
-from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.files import open_fits, read_image
 from pyklip_diffrender.io.headers import fits_text, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings, settings_of
 from pyklip_diffrender.scene.admission import FrameFile
 from pyklip_diffrender.scene.exposure import beginning, is_reference, middle, star_of
-from pyklip_diffrender.scene.integrations import pointings
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, SHIFTS
-from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.integrations import (
+    checked_stacks,
+    compressed,
+    mask_unusable,
+    pointings,
+)
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, SHIFTS, single_precision, unflagged
+from pyklip_diffrender.scene.observation import Observation, frames_in
 from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = [
@@ -111,7 +117,7 @@ class SourceFrames:
     # (N, ny, nx), before resampling; NaN where the flags say NON_SCIENCE.
     data: NDArray[np.floating[Any]]
     # (N, ny, nx), standard deviations from ERR in the unit of `data`.
-    error: NDArray[np.float64] | None
+    error: NDArray[np.floating[Any]] | None
     # (N, ny, nx), False where a flag excludes the pixel from the fit.
     usable: NDArray[np.bool_]
     # (N, 2), x, y of the star in `data`, 0-indexed.
@@ -231,19 +237,22 @@ def read_source(
     from pyklip.klip import align_and_scale
 
     paths = [filepaths] if isinstance(filepaths, str) else list(filepaths)
-    files = [_read(path, dataset) for path in paths]
+    files: list[_File] = []
+    shifted: list[NDArray[np.float32]] = []
+    middle = np.zeros(2)
+    for path in paths:
+        file, as_read, center = _read(path, dataset)
+        if not files:
+            middle = (np.array(as_read.shape[:0:-1]) - 1) / 2.0
+        for frame in as_read if late else as_read[: 0 if files else 1]:
+            moved = align_and_scale(frame, new_center=middle, old_center=center)
+            shifted.append(np.asarray(moved, dtype=np.float32))
+        files.append(file)
     counts = [len(file.data) for file in files]
-    middle = (np.array(files[0].data.shape[:0:-1]) - 1) / 2.0
-
-    def shifted(file: _File, frame: int) -> NDArray[np.float64]:
-        return np.asarray(
-            align_and_scale(file.as_read[frame], new_center=middle, old_center=file.center_read)
-        )
-
     aligned, centers = np.array(dataset.input), np.array(dataset.centers)
     names = tuple(str(name) for name in dataset.filenames)
     if late:
-        aligned = np.array([shifted(f, k) for f in files for k in range(len(f.data))], np.float32)
+        aligned = np.array(shifted)
         centers = np.tile(middle, (len(aligned), 1))
         names = tuple(
             f"{Path(path).name}_INT{k + 1}"
@@ -253,11 +262,11 @@ def read_source(
     judged = _JUDGED.get()
     source = SourceFrames(
         headers=[file.header for file, n in zip(files, counts, strict=True) for _ in range(n)],
-        data=np.concatenate([file.data for file in files]),
+        data=_joined([file.data for file in files]),
         error=None
         if any(file.error is None for file in files)
-        else np.concatenate([file.error for file in files if file.error is not None]),
-        usable=np.concatenate([file.usable for file in files]),
+        else _joined([file.error for file in files if file.error is not None]),
+        usable=_joined([file.usable for file in files]),
         centers=np.concatenate([file.centers for file in files]),
         aligned=aligned,
         aligned_centers=centers,
@@ -270,9 +279,14 @@ def read_source(
     )
     if not late:
         same_shape = source.data.shape == aligned.shape
-        if not same_shape or not _is_close(shifted(files[0], 0), aligned[0]):
+        if not same_shape or not _is_close(shifted[0], aligned[0]):
             raise ValueError(f"{paths[0]}: pyKLIP shifted these frames in a way not known here")
     return source
+
+
+def _joined(stacks: abc.Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Frames of all files, (N, ny, nx), without a copy of those of a single file."""
+    return stacks[0] if len(stacks) == 1 else np.concatenate(stacks)
 
 
 def _is_close(one: NDArray[Any], other: NDArray[Any]) -> bool:
@@ -287,39 +301,83 @@ class _File(NamedTuple):
     file: FrameFile
     header: fits.Header
     data: NDArray[np.floating[Any]]
-    error: NDArray[np.float64] | None
+    error: NDArray[np.floating[Any]] | None
     usable: NDArray[np.bool_]
     centers: NDArray[np.float64]
     first_pixel: tuple[int, int] | None
     star_offset: tuple[float, float] | None
-    # The frames, and their star's x, y, as pyKLIP reads them.
-    as_read: NDArray[Any]
-    center_read: NDArray[np.float64]
 
 
 class OpenedFile(NamedTuple):
-    """What a file holds, for `reduce` and as pyKLIP reads it."""
+    """What a file holds, for `reduce` and as pyKLIP reads it.
+
+    Attributes
+    ----------
+    file : FrameFile
+    primary, science : Header
+    as_read : ndarray, (N, ny, nx)
+        The pixels as pyKLIP reads them.
+    usable : ndarray of bool, (N, ny, nx)
+        Where no flag excludes them from the fit.
+    frames : Observation or DiffrenderError or None
+        All integrations, with the pixels and errors of `SourceFrames`, or why they cannot be read;
+        None for a file without frames.
+    aligned : bool
+        Whether the file has shifts, which were undone in `frames`.
+    """
 
     file: FrameFile
     primary: fits.Header
     science: fits.Header
-    pixels: NDArray[Any]
-    flags: NDArray[Any]
+    as_read: NDArray[np.floating[Any]]
+    usable: NDArray[np.bool_]
+    frames: Observation | DiffrenderError | None
     aligned: bool
 
     @classmethod
     def at(cls, path: str | os.PathLike[str]) -> OpenedFile:
-        """Open a file, once; raises CorruptFileError, and KeyError without a SCI extension."""
+        """Open a file, once, and read it plane by plane; KeyError without a SCI extension."""
         where = Path(path).absolute()
-        with open_fits(where) as hdus:
-            return cls(
-                FrameFile.in_hdus(hdus, where, frames=True),
-                hdus[0].header,
-                hdus["SCI"].header,
-                hdus["SCI"].data,
-                hdus["DQ"].data if "DQ" in hdus else np.zeros((), np.uint32),
-                any(name in hdus for name in SHIFTS),
-            )
+        with open_fits(where, images=False) as hdus:
+            file = FrameFile.in_hdus(hdus, where, frames=False)
+            science = hdus["SCI"]
+            if not science.is_image:
+                raise CorruptFileError(f"{where.name}: SCI is a table, not an image")
+            aligned = any(name in hdus for name in SHIFTS)
+            frames = None if file.is_product else _every_integration(hdus, file)
+            single = science.header["BITPIX"] == -32
+            as_read = read_image(science, where, single_precision if single else native_float64)
+            as_read = as_read[np.newaxis] if as_read.ndim == 2 else as_read
+            as_read[~_without_flags(hdus, where, NON_SCIENCE, as_read.shape)] = np.nan
+            if isinstance(frames, Observation):
+                usable = frames.valid
+                # The gaps of frames that are put back are where they were before the shift.
+                frames.data[~(usable if aligned else np.isfinite(as_read))] = np.nan
+                frames.error[~usable] = 0.0
+            else:
+                usable = _without_flags(hdus, where, BAD_PIXEL_BITS, as_read.shape)
+            return cls(file, hdus[0].header, science.header, as_read, usable, frames, aligned)
+
+
+def _every_integration(hdus: fits.HDUList, file: FrameFile) -> Observation | DiffrenderError:
+    """All integrations of an open file, and their means into the file; or why there are none."""
+    try:
+        frames = Observation(**frames_in(hdus, file.path, every_integration=True, compact=True))
+        file.frames = frames.means()
+    except DiffrenderError as error:
+        file.frames = error
+        return error
+    return frames
+
+
+def _without_flags(
+    hdus: fits.HDUList, path: Path, bits: int, shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """Pixels of an open file without one of these flags, (N, ny, nx)."""
+    if "DQ" not in hdus:
+        return np.ones(shape, dtype=bool)
+    good = read_image(hdus["DQ"], path, lambda flags: unflagged(flags, path.name, bits))
+    return np.broadcast_to(good, shape)
 
 
 class JudgedFiles(NamedTuple):
@@ -342,16 +400,12 @@ def judged_before(files: JudgedFiles) -> Iterator[None]:
         _JUDGED.reset(token)
 
 
-def _read(path: str, dataset: Any) -> _File:
-    """Read one file as `reduce` does, for the star's position that pyKLIP has read."""
+def _read(path: str, dataset: Any) -> tuple[_File, NDArray[np.floating[Any]], NDArray[np.float64]]:
+    """Read one file as `reduce` does, and its pixels, (N, ny, nx), and star, (2,), as pyKLIP."""
     judged = _JUDGED.get()
     known = None if judged is None else judged.files.get(Path(path).absolute())
-    file, primary, science, pixels, flags, aligned = known or OpenedFile.at(path)
+    file, primary, science, as_read, usable, frames, aligned = known or OpenedFile.at(path)
     header = merged_header(primary, science, path)
-    as_read = np.array(pixels)
-    as_read = as_read[np.newaxis] if as_read.ndim == 2 else as_read
-    flags = np.broadcast_to(flags, as_read.shape)
-    as_read[(flags & NON_SCIENCE) != 0] = np.nan
     # As pyKLIP finds the centre: the given keywords, else CRPIX, plus the dither if requested.
     keywords = (dataset.center_kw_x, "CRPIX1"), (dataset.center_kw_y, "CRPIX2")
     center = np.array([science.get(key, science.get(other)) - 1 for key, other in keywords], float)
@@ -359,12 +413,10 @@ def _read(path: str, dataset: Any) -> _File:
         offset = np.array([primary["XOFFSET"], primary["YOFFSET"]])
         center += offset / np.sqrt(science["PIXAR_A2"])
     centers = np.tile(center, (len(as_read), 1))
-    frames = file.frames
     if isinstance(frames, CorruptFileError | NoValidPixelsError):
         # Such as a file without errors, or a frame of which all pixels are flagged.
         _log.warning("only the pixels and flags are used: %s", frames)
-        usable = (flags & BAD_PIXEL_BITS) == 0
-        return _File(file, header, as_read, None, usable, centers, None, None, as_read, center)
+        return _File(file, header, as_read, None, usable, centers, None, None), as_read, center
     if not isinstance(frames, Observation):
         raise frames or CorruptFileError(f"{path}: no frames")
     if aligned:
@@ -374,20 +426,17 @@ def _read(path: str, dataset: Any) -> _File:
             for k, axis in ((1, "X"), (2, "Y"))
         ]
         centers += frames.center - (np.array(stated, dtype=float) - 1)
-    # The gaps of frames that are put back are where they were before the shift.
-    seen = frames.valid if aligned else np.isfinite(as_read)
-    return _File(
+    read = _File(
         file,
         header,
-        np.where(seen, frames.data, np.nan),
-        np.where(frames.valid, frames.error, 0.0),
-        frames.valid,
+        frames.data,
+        frames.error,
+        usable,
         centers,
         frames.first_pixel,
         frames.star_offset,
-        as_read,
-        center,
     )
+    return read, as_read, center
 
 
 def keeping_references(readpsflib: Callable[..., None]) -> Callable[..., None]:
@@ -433,12 +482,13 @@ def recorded_frames(
     places: NDArray[np.intp] | None,
     dataset: Any,
     index: NDArray[np.intp],
-    imgs: NDArray[np.float64],
+    imgs: NDArray[Any],
 ) -> Recorded:
     """Recorded pixels plus what was added to `imgs` (n, ny, nx) since reading, in the files' unit.
 
-    `index` and `places` (n,) say where the frames are in the dataset and, of all its frames, in
-    `source`. Raises NotRecordedError if no recorded pixels correspond to those of the dataset.
+    Frame by frame, so that the changes of all frames are not in memory at once. `index` and
+    `places` (n,) say where the frames are in the dataset and, of all its frames, in `source`.
+    Raises NotRecordedError if no recorded pixels correspond to those of the dataset.
     """
     from pyklip.klip import align_and_scale
 
@@ -454,30 +504,30 @@ def recorded_frames(
     # of the array. So added = now / factor - S recorded, and the fit takes recorded + S^-1 added,
     # where S^-1 shifts it back: only what was added has been interpolated, and not the noise.
     rows = places[index]
-    before = native_float64(source.aligned[rows])
-    factor = np.array([_factor(one, other) for one, other in zip(imgs, before, strict=True)])
-    # Pixels that were NaN when they were read belong to flagged ones, whatever was filled in.
-    change = np.where(np.isfinite(before), imgs / factor[:, None, None] - before, 0.0)
     data = native_float64(source.data[rows])
     error = None if source.error is None else native_float64(source.error[rows])
-    if error is not None:
-        _require_same(change, error, source.usable[rows])
     valid = source.usable[rows] & np.isfinite(data)
-    centers = native_float64(dataset.centers)[index]
+    centers, factors = native_float64(dataset.centers)[index], np.ones(len(rows))
     moved = centers - source.aligned_centers[rows]
     for i, frame in enumerate(rows):
+        now, before = native_float64(imgs[i]), native_float64(source.aligned[frame])
+        factors[i] = _factor(now, before)
+        # Pixels that were NaN when they were read belong to flagged ones, whatever was filled in.
+        change = np.where(np.isfinite(before), now / factors[i] - before, 0.0)
+        if error is not None:
+            _require_same(change, error[i], source.usable[frame])
         shift = {"new_center": source.centers[frame], "old_center": source.aligned_centers[frame]}
-        masked = np.isnan(imgs[i]) & np.isfinite(before[i])
-        added = np.where(np.isfinite(change[i]), change[i], 0.0)
+        masked = np.isnan(now) & np.isfinite(before)
+        added = np.where(np.isfinite(change), change, 0.0)
         # A changed factor is known to the rounding of single precision.
-        peak = np.max(np.abs(before[i]), where=np.isfinite(before[i]), initial=0.0)
+        peak = np.max(np.abs(before), where=np.isfinite(before), initial=0.0)
         if np.abs(added).max() > _SINGLE_PRECISION * peak:
             # Nothing is known beyond the edge of the shifted frame; assume nothing was added.
             data[i] += np.nan_to_num(align_and_scale(added, **shift))
         if masked.any():
             # A pixel masked by hand invalidates every recorded pixel that contributed to it.
             valid[i] &= np.nan_to_num(align_and_scale(masked.astype(float), **shift)) < 0.1
-    return Recorded(data, valid, error, source.centers[rows] + moved, factor)
+    return Recorded(data, valid, error, source.centers[rows] + moved, factors)
 
 
 def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
@@ -512,16 +562,15 @@ def _require_same(
     """Raise NotRecordedError if most pixels of a frame (ny, nx) changed by more than the noise."""
     # Faint sources change few pixels, and another background changes all by the same amount:
     # neither moves the median distance from the median.
-    for frame, sigma, good in zip(change, error, usable, strict=True):
-        known, scale = frame[np.isfinite(frame)], sigma[good & (sigma > 0)]
-        if not known.size or not scale.size:
-            continue
-        spread = float(np.median(np.abs(known - np.median(known))))
-        if spread > float(np.median(scale)):
-            raise NotRecordedError(
-                "most of its pixels were changed by more than their noise after reading, for "
-                "example by a filter"
-            )
+    known, scale = change[np.isfinite(change)], error[usable & (error > 0)]
+    if not known.size or not scale.size:
+        return
+    spread = float(np.median(np.abs(known - np.median(known))))
+    if spread > float(np.median(scale)):
+        raise NotRecordedError(
+            "most of its pixels were changed by more than their noise after reading, for "
+            "example by a filter"
+        )
 
 
 # Files of a dataset and of its library of reference stars, judged as `Sequence` judges files.
@@ -629,9 +678,15 @@ class Pointing:
         return f"<Pointing: frames {', '.join(map(str, self.frames))} of {self.observation.name!r}>"
 
 
-def part_of(observation: Observation, which: NDArray[np.intp] | NDArray[np.bool_]) -> Observation:
-    """Some frames of an observation, chosen by an index array or a mask."""
+def part_of(observation: Observation, which: Any) -> Observation:
+    """Some frames of an observation, chosen by an index array or a mask.
+
+    Frames that follow each other are not copied.
+    """
     angles = observation.position_angles
+    index = np.flatnonzero(which) if which.dtype == bool else which
+    if len(index) and (np.diff(index) == 1).all():
+        which = slice(index[0], index[-1] + 1)
     return dataclasses.replace(
         observation,
         data=observation.data[which],
@@ -827,11 +882,11 @@ def frames_of(
         )
     usable = every.usable.copy()
     usable[np.flatnonzero(usable)[~target]] = False
+    every = every if target.all() else replace(every, data=every.data[target])
     used = part_of(observation, target)
     return replace(
         every,
         observation=used,
-        data=every.data[target],
         usable=usable,
         pointings=tuple(
             pointings_of(used, [d for d, yes in zip(details, target, strict=True) if yes])
@@ -845,9 +900,8 @@ def _gather(
     dataset: Any, index: NDArray[np.intp], imgs: NDArray[Any], settings: DiffrenderSettings
 ) -> Frames:
     """Gather all frames of one wavelength, of whatever star; warns if the files are of no use."""
-    imgs = native_float64(imgs)
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
-    data, valid, error = imgs, np.isfinite(imgs), None
+    recorded: Recorded | None = None
     centers, pixels, noise = native_float64(dataset.centers)[index], "as given", "ERR"
     header, unit, pixelscale = fits.Header(), settings.unit, settings.pixelscale
     factor, lost = np.ones(len(imgs)), why_without_source(dataset)
@@ -858,12 +912,15 @@ def _gather(
             recorded = recorded_frames(source, places, dataset, index, imgs)
         except NotRecordedError as reason:
             lost = str(reason)
-        else:
-            data, valid, error, centers, factor = recorded
-            pixels = "recorded"
         if unit is None:
             unit = u.Unit(header.get("BUNIT", ""), parse_strict="silent")
         pixelscale = source.pixelscale if pixelscale is None else pixelscale
+    if recorded is not None:
+        data, valid, error, centers, factor = recorded
+        pixels = "recorded"
+    else:
+        data, error = native_float64(imgs), None
+        valid = np.isfinite(data)
     if lost is not None:
         warnings.warn(
             f"the errors and original pixels of the files cannot be used: {lost}. The shifted "
@@ -888,10 +945,13 @@ def _gather(
     if pixelscale is None:
         known = passband is not None and passband.upper() in FILTERS
         pixelscale = detector_place(None, passband if passband and known else "F444W").pixelscale
-    observation = Observation.from_arrays(
-        data[usable],
-        error[usable],
-        valid=valid[usable],
+    if not usable.all():
+        data, error, valid = (compressed(each, usable) for each in (data, error, valid))
+    # The errors and masks are its own, as the arrays that `Observation.from_arrays` would copy.
+    frames = checked_stacks(
+        data.copy(),
+        error,
+        valid=valid,
         unit=u.dimensionless_unscaled if unit is None else unit,
         pixelscale=pixelscale,
         center=centers[usable],
@@ -901,7 +961,8 @@ def _gather(
         name=name,
         header=header,
     )
-    return Frames(observation, data[usable], usable, pixels, noise, factor=factor[usable])
+    mask_unusable(frames)
+    return Frames(Observation(**frames), data, usable, pixels, noise, factor=factor[usable])
 
 
 def _usable(valid: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:

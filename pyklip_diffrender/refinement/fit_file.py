@@ -186,6 +186,7 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
         "reference": combined.reference,
         "star_offset": combined.star_offset,
         "first_pixel": combined.first_pixel,
+        "integrations": combined.integrations,
         "header": combined.header.tostring(sep="\n"),
     }
     arrays = {
@@ -218,6 +219,8 @@ def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Obs
         reference=facts["reference"],
         star_offset=None if offset is None else tuple(offset),
         first_pixel=None if first_pixel is None else tuple(first_pixel),
+        # Files of earlier versions do not say it.
+        integrations=tuple(facts.get("integrations", ())),
         header=fits.Header.fromstring(facts["header"], sep="\n"),
     )
 

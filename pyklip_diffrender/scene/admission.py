@@ -86,14 +86,14 @@ class FrameFile:
     for_reference: bool = False  # asked for as a reference star's, whatever its header says
     is_product: bool = False  # made from frames, and has none
     place: tuple[float, float] | None = None  # x, y of the star, from 0, if not the header's
-    # One for every integration, or why they cannot be read; None until they are needed.
+    # The mean of the integrations of each pointing, or why they cannot be read; None until needed.
     frames: Observation | DiffrenderError | None = field(default=None, repr=False)
     # The mean of the integrations of each pointing that are used, once they were read.
     observation: Observation | None = field(default=None, repr=False)
 
     @classmethod
     def in_hdus(cls, hdus: fits.HDUList, path: Path, *, frames: bool) -> FrameFile:
-        """Read the header of an open file, and its frames if they are asked for."""
+        """Read the header of an open file, and the means of its frames if they are asked for."""
         product = _why_a_product(hdus)
         if product:
             return cls(path, Exposure(path.name), reason=product, is_product=True)
@@ -106,14 +106,14 @@ class FrameFile:
             file = cls(path, Exposure(path.name), reason=_without_name(error, path.name))
         if frames:
             try:
-                file.frames = Observation.from_hdus(hdus, path)
+                file.frames = Observation.means_from_hdus(hdus, path)
             except DiffrenderError as error:
                 file.frames = error
         return file
 
     @classmethod
     def opened(cls, path: Path, *, frames: bool) -> FrameFile:
-        """Open a file once, and read its header, and its frames if they are asked for."""
+        """Open a file once; read its header, and the means of its frames if they are asked for."""
         try:
             with open_fits(path, images=False) as hdus:
                 return cls.in_hdus(hdus, path, frames=frames)
@@ -140,7 +140,7 @@ class FrameFile:
             raise self.frames
         if self.frames is None:
             return Observation.means_from_fits(self.path, star=self.place)
-        return self.frames.means()
+        return self.frames
 
 
 def _without_name(error: Exception, name: str) -> str:
@@ -535,7 +535,9 @@ def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[Fram
     names = ("INSTRUME", "DETECTOR", "mask", "PUPIL", "FILTER", "BUNIT")
     for each in (*science, *references):
         different = [
-            f"{name} is {own or 'not stated'}, not {other}"
+            f"{name} is {own}, which they do not state; add the card"
+            if other is None
+            else f"{name} is {own or 'not stated'}, not {other}"
             for name, own, other in zip(names, each.exposure.setup, majority, strict=True)
             if own != other
         ]

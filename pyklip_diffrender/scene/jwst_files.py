@@ -58,7 +58,9 @@ __all__ = [
     "recorded_shifts",
     "shift_frames",
     "shift_variances",
+    "single_precision",
     "undo_shifts",
+    "unflagged",
     "without_empty",
 ]
 
@@ -379,13 +381,13 @@ def read_calints(
             raise CorruptFileError(f"{name}: {hdu.name} has no data, so no frames")
     # With the mask, pixels and errors in single precision take three quarters of the file's size.
     single = compact and science.header["BITPIX"] == -32
-    as_float = _single_precision if single else native_float64
+    as_float = single_precision if single else native_float64
     data = read_image(science, path, as_float)
     if "ERR" not in hdus:
         raise CorruptFileError(f"{name}: no ERR extension; the fit needs errors")
     error = read_image(hdus["ERR"], path, as_float)
     if "DQ" in hdus:
-        valid = read_image(hdus["DQ"], path, lambda flags: _unflagged(flags, name))
+        valid = read_image(hdus["DQ"], path, lambda flags: unflagged(flags, name))
     else:
         warnings.warn(
             f"{name}: no DQ extension; only NaN pixels are masked",
@@ -427,16 +429,17 @@ def read_calints(
     return arguments, shifts
 
 
-def _single_precision(image: Any) -> NDArray[np.float32]:
+def single_precision(image: Any) -> NDArray[np.float32]:
+    """Copy of an image of a file in single precision, in the machine's byte order."""
     return np.array(image, dtype=np.float32, order="C")
 
 
-def _unflagged(flags: Any, name: str) -> NDArray[np.bool_]:
-    """Pixels without a flag of `BAD_PIXEL_BITS`, (ny, nx)."""
+def unflagged(flags: Any, name: str, bits: int = BAD_PIXEL_BITS) -> NDArray[np.bool_]:
+    """Pixels without one of these flags, (ny, nx)."""
     flags = np.asarray(flags)
     if flags.dtype.kind not in "iu":
         raise CorruptFileError(f"{name}: DQ holds {flags.dtype.name}, expected integers (flags)")
-    return (flags.astype(np.uint32) & BAD_PIXEL_BITS) == 0
+    return (flags.astype(np.uint32) & bits) == 0
 
 
 def without_empty(

@@ -123,14 +123,19 @@ def frames_in(
     path: str | os.PathLike[str],
     *,
     every_integration: bool,
+    compact: bool = False,
     star: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
-    """Read and judge the calints file at that path, which is open, see `frames_of_file`."""
-    frames, kept, original = _judged(hdus, path, compact=False, star=star)
+    """Read and judge the calints file at that path, which is open, see `frames_of_file`.
+
+    `compact` keeps pixels and errors in single precision if the file does.
+    """
+    frames, kept, original = _judged(hdus, path, compact=compact, star=star)
     if not every_integration:
         return frames if kept.all() else frames | selected(frames, np.flatnonzero(kept))
-    # Frames of empty integrations have the pixels of the one before, and none is valid.
-    frames |= selected(frames, np.maximum(np.cumsum(original) - 1, 0))
+    if not original.all():
+        # Frames of empty integrations have the pixels of the one before, and none is valid.
+        frames |= selected(frames, np.maximum(np.cumsum(original) - 1, 0))
     every = original.copy()
     every[original] = kept
     mask_unusable(frames, np.broadcast_to(every[:, None, None], frames["valid"].shape))
@@ -146,7 +151,14 @@ def means_of_file(
     `Observation.means_from_fits`.
     """
     with open_fits(path, images=False) as hdus:
-        frames, kept, _ = _judged(hdus, path, compact=True, star=star)
+        return means_in(hdus, path, star=star)
+
+
+def means_in(
+    hdus: fits.HDUList, path: str | os.PathLike[str], *, star: tuple[float, float] | None = None
+) -> dict[str, Any]:
+    """Read, judge and average the calints file at that path, which is open, see `means_of_file`."""
+    frames, kept, _ = _judged(hdus, path, compact=True, star=star)
     return frames | means_of_pointings(frames, np.flatnonzero(kept))
 
 
@@ -398,12 +410,9 @@ class Observation:
         return cls(**frames_of_file(path, every_integration=every_integration, star=star))
 
     @classmethod
-    def from_hdus(cls, hdus: fits.HDUList, path: str | os.PathLike[str]) -> Observation:
-        """Read the calints file at that path, which `open_fits` has opened, as `from_fits` does.
-
-        There is a frame for every integration.
-        """
-        return cls(**frames_in(hdus, path, every_integration=True))
+    def means_from_hdus(cls, hdus: fits.HDUList, path: str | os.PathLike[str]) -> Observation:
+        """Read the file at that path, which `open_fits` has opened, as `means_from_fits` does."""
+        return cls(**means_in(hdus, path))
 
     @classmethod
     def means_from_fits(
