@@ -102,7 +102,7 @@ def linearised(fit: dr.Refinement, count: int) -> Filter:
 
 def zernikes_in(fit: dr.Refinement, noll: tuple[int, ...]) -> torch.Tensor:
     """Coefficients of the modes, (modes, Zernikes), that have the shape of Zernikes of rms 1 nm."""
-    grid = fit.frames[0].model.entrance
+    grid = fit.frames[0].model.entrance.grid
     modes = fit.basis.modes(grid, 0, len(fit.basis)).double()
     rows, columns = modes.shape[1:]
     y = (torch.arange(rows, dtype=torch.float64) - (rows - 1) / 2) / (rows / 2)
@@ -198,7 +198,7 @@ def main() -> None:
         "all modes": frequency >= 0,
     }  # fmt: skip
     cases |= {name: (everything[:, use], one.deviation[use]) for name, use in bands.items()}
-    grid = fit.frames[0].model.entrance
+    grid = fit.frames[0].model.entrance.grid
     mirror = fit.basis.opd(segments.double(), grid) != 0
     for name, (directions, deviation) in cases.items():
         rise, difference, _ = together(one, two, directions, deviation)
