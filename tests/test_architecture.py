@@ -212,6 +212,7 @@ def test_the_directory_of_the_package_is_its_public_names():
     assert dir(dr) == sorted({*dr.__all__, *dr._SUBMODULES})
 
 
+@pytest.mark.slow
 def test_documented_names_of_submodules_load_in_a_fresh_interpreter():
     page = (ROOT / "docs/reference/api.md").read_text(encoding="utf-8")
     names = re.findall(r"^   ((?:[a-z]\w*\.)+\w+)$", page, re.MULTILINE)

@@ -356,6 +356,7 @@ def test_a_faint_companion_is_found_in_the_sum_of_epochs():
     assert all(name.endswith("spectra") for name in both.thresholds)
 
 
+@pytest.mark.slow
 def test_orbits_allow_a_bound_source_to_move():
     """At 0.7 arcsec and 10 pc a circular orbit moves by 0.24 arcsec a year."""
     start = np.array([0.5, 0.45])

@@ -60,7 +60,10 @@ def peak(read):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("write", [plain, shifted, packed])
+WRITERS = [plain, shifted, pytest.param(packed, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("write", WRITERS)
 def test_a_sequence_takes_at_most_one_and_a_half_times_its_largest_file(
     tmp_path, monkeypatch, write
 ):
@@ -73,7 +76,7 @@ def test_a_sequence_takes_at_most_one_and_a_half_times_its_largest_file(
     assert peak(lambda: Observation.means_from_fits(path)) < 1.5 * size
 
 
-@pytest.mark.parametrize("write", [plain, shifted, packed])
+@pytest.mark.parametrize("write", WRITERS)
 def test_the_means_of_a_file_are_those_of_its_integrations(tmp_path, monkeypatch, write):
     path = write(tmp_path)
     frames = Observation.from_fits(path)

@@ -534,7 +534,12 @@ def test_the_report_says_who_is_deeper_where(klip, said):
 
 
 @pytest.mark.parametrize(
-    ("form", "begins"), [("pdf", b"%PDF"), ("png", b"\x89PNG"), ("svg", b"<?xml")]
+    ("form", "begins"),
+    [
+        pytest.param("pdf", b"%PDF", marks=pytest.mark.slow),
+        ("png", b"\x89PNG"),
+        pytest.param("svg", b"<?xml", marks=pytest.mark.slow),
+    ],
 )
 def test_every_figure_is_a_file_of_its_own(tmp_path, form, begins):
     whole = reduction()

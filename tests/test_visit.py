@@ -135,6 +135,7 @@ def test_references_make_the_limits_deeper_and_leave_the_planet_alone():
     assert 0.8 < np.nanstd(detection.residual_snr[distant]) < 1.2
 
 
+@pytest.mark.slow
 def test_a_companion_of_a_reference_is_masked_and_named():
     fit, visit = joined(*(reference(k, companion=4e-4) for k in range(2)))
     assert [each.use for each in visit.contributions] == ["joint"] * 2
@@ -179,6 +180,7 @@ def test_the_fit_of_the_target_is_kept_where_references_do_not_help():
     assert joined() == (alone()[1], Visit())
 
 
+@pytest.mark.slow
 def test_limits_are_compared_as_they_are_stated():
     choice, fit = alone()
     searched = []
@@ -282,6 +284,7 @@ def test_the_size_of_the_drift_is_that_of_the_frames(rms, least, most):
     assert joint.scales["texture dither"] <= 4.0001 * 0.3
 
 
+@pytest.mark.slow
 def test_frames_that_never_agree_are_left_out(monkeypatch):
     monkeypatch.setattr(visits, "_ROUNDS", 2)
     monkeypatch.setattr(
