@@ -319,21 +319,39 @@ def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
     assert "--resume keeps products" in capsys.readouterr().err
 
 
+def two_filters(folder):
+    """A folder with a frame of one star in each of two filters."""
+    frames = folder / "frames"
+    frames.mkdir()
+    for name in ("F356W", "F444W"):
+        cards = {"TARGPROP": "HIP-1", "FILTER": name, "INSTRUME": None}
+        data = np.random.default_rng(1).normal(10, 2, (2, 8, 10))
+        calints(frames / f"{name}_calints.fits", data, primary=cards)
+    return frames
+
+
+def test_spectra_that_do_not_cover_a_filter_are_an_error_before_any_fit(
+    tmp_path, maps, reduced, capsys
+):
+    table = tmp_path / "short.txt"
+    table.write_text("# micron Y\n3.0 1\n3.5 2\n4.1 3\n", encoding="utf-8")
+    arguments = ["reduce", str(two_filters(tmp_path)), "--opd", str(maps), "--size", "8"]
+    arguments += ["-o", str(tmp_path / "products"), "--spectra", str(table)]
+    assert main(arguments) == 1
+    assert re.search(r"Y: .* F444W needs", capsys.readouterr().err)
+    assert reduced == []
+
+
 def test_a_resumed_command_keeps_reductions_and_searches_them_together_again(
     tmp_path, maps, reduced, capsys
 ):
     """Two filters, of which one had finished before the interruption."""
-    frames, products = tmp_path / "frames", tmp_path / "products"
-    frames.mkdir()
+    frames, products = two_filters(tmp_path), tmp_path / "products"
     place = (0.6, 0.35)
     made = {
         "F356W": searched("F356W", 2, [(*place, 4.0)]),
         "F444W": searched("F444W", 1, [(*place, 4.2)], north=20.0),
     }
-    for name in made:
-        path = frames / f"{name}_calints.fits"
-        cards = {"TARGPROP": "HIP-1", "FILTER": name, "INSTRUME": None}
-        calints(path, np.random.default_rng(1).normal(10, 2, (2, 8, 10)), primary=cards)
     arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "--size", "8"]
     write_searched(made["F356W"], products / "F356W")
     reduced.error = KeyboardInterrupt()
