@@ -8,7 +8,6 @@ import subprocess
 import sys
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import click
 import pytest
@@ -25,7 +24,7 @@ from pyklip_diffrender.surveys.config import Options
 SOURCE = Path(module.__file__)
 
 
-def test_every_option_is_on_the_command_line_or_has_a_reason() -> None:
+def test_every_option_is_on_the_command_line_or_has_a_reason():
     for command in (application.commands["reduce"], application.commands["detect"]):
         params = {each.opts[-1]: each for each in command.params if isinstance(each, click.Option)}
         for option in OPTIONS.values():
@@ -38,19 +37,19 @@ def test_every_option_is_on_the_command_line_or_has_a_reason() -> None:
                 assert shown.default == option.default
 
 
-def test_every_option_is_a_key_of_surveys_or_has_a_reason() -> None:
+def test_every_option_is_a_key_of_surveys_or_has_a_reason():
     keys = Options().keywords
     assert {name for name, each in OPTIONS.items() if not each.not_in_surveys} == set(keys)
     assert all(OPTIONS[name].default == value for name, value in keys.items())
 
 
-def test_keywords_of_reduce_are_the_fields_with_their_types() -> None:
+def test_keywords_of_reduce_are_the_fields_with_their_types():
     keywords = {name: each.__forward_arg__ for name, each in ReduceKeywords.__annotations__.items()}
     assert keywords == {each.name: each.type for each in fields(ReduceOptions)}
     assert "Unpack[ReduceKeywords]" in str(inspect.signature(dr.reduce))
 
 
-def test_the_docstring_describes_every_option() -> None:
+def test_the_docstring_describes_every_option():
     parameters = (inspect.getdoc(ReduceOptions) or "").partition("Parameters\n")[2]
     parameters = " ".join(parameters.partition("Attributes\n")[0].split())
     for option in OPTIONS.values():
@@ -58,7 +57,7 @@ def test_the_docstring_describes_every_option() -> None:
         assert len(option.meaning) > 10
 
 
-def test_settings_of_the_backend_are_unset_and_those_of_spaceklip_are_the_usual_ones() -> None:
+def test_settings_of_the_backend_are_unset_and_those_of_spaceklip_are_the_usual_ones():
     settings = {each.name: each.default for each in fields(dr.DiffrenderSettings)}
     shared = settings.keys() & OPTIONS.keys()
     assert {"threshold", "disk", "star_flux_error"} < shared
@@ -68,9 +67,9 @@ def test_settings_of_the_backend_are_unset_and_those_of_spaceklip_are_the_usual_
             assert each.default == OPTIONS[name].default
 
 
-def defaults(tree: ast.AST) -> list[tuple[int, str, object]]:
+def defaults(tree):
     """Line, name and value of every default that is written out."""
-    found: list[tuple[int, str, ast.expr | None]] = []
+    found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.arguments):
             named = [*zip(node.args[::-1], node.defaults[::-1], strict=False)]
@@ -87,7 +86,7 @@ def defaults(tree: ast.AST) -> list[tuple[int, str, object]]:
     return [(k, name, each.value) for k, name, each in found if isinstance(each, ast.Constant)]
 
 
-def test_no_default_is_repeated() -> None:
+def test_no_default_is_repeated():
     """Outside the table, and the functions of which a reduction is made."""
     repeated = []
     for folder in ("reduction", "pyklip_backend", "spaceklip", "surveys", "cli"):
@@ -120,7 +119,7 @@ def test_no_default_is_repeated() -> None:
         ("max_chi2", 0, "inf for no limit"),
     ],
 )
-def test_values_that_are_not_allowed(name: str, value: Any, words: str) -> None:
+def test_values_that_are_not_allowed(name, value, words):
     with pytest.raises(IncompatibleSetupError) as raised:
         OPTIONS[name].checked(value)
     assert words in str(raised.value)
@@ -128,7 +127,7 @@ def test_values_that_are_not_allowed(name: str, value: Any, words: str) -> None:
         ReduceOptions(**{name: value})
 
 
-def test_values_are_kept_as_plain_ones() -> None:
+def test_values_are_kept_as_plain_ones():
     np = pytest.importorskip("numpy")
     given = ReduceOptions(
         size=np.int64(40), threshold=np.float32(4), wide=np.True_, max_chi2=np.inf
@@ -164,7 +163,7 @@ main(["reduce", "--help"])
 
 
 @pytest.mark.slow
-def test_an_option_is_added_by_one_field() -> None:
+def test_an_option_is_added_by_one_field():
     done = subprocess.run(
         [sys.executable, "-c", PLANTED.replace("PATH", repr(str(SOURCE)))],
         cwd=SOURCE.parents[1],

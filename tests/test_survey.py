@@ -412,8 +412,6 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path):
         assert (output / link).exists()
 
 
-# -- filters and epochs of a star together ---------------------------------------------------------
-
 STAR = {"TARGPROP": "HD 1", "TARG_RA": 10.0, "TARG_DEC": 5.0}
 OTHER = {"TARGPROP": "HD 2", "TARG_RA": 90.0, "TARG_DEC": 5.0}
 PLACE = (0.6, 0.35)
