@@ -210,6 +210,12 @@ CLAIMS = (
     Claim("README.md", "a contrast of {:.2f}e-4 +- {:.2f}e-4 (published: {:.2f}e-4 +- {:.2f}e-4)",
           lambda: [*companion("contrast of the companion", 1e4),
                    *companion("published contrast", 1e4)]),
+    # -- resources
+    Claim("docs/howto/resources.md", "814 integrations, takes {:.2f} times its size",
+          lambda: [stated("memory of reading over the size of the file", setting="1 GB")]),
+    Claim("docs/howto/resources.md", "reading takes {:.1f} times the file (`--dataset",
+          lambda: [stated("memory of reading over the size of the file",
+                          setting="pyKLIP dataset, 0.2 GB")]),
     # -- paper
     Claim("paper/paper.md", "factors of {:.1f} (F356W) and {:.1f} (F444W) for HIP 17695, "
           "and of {:.1f} and {:.1f} for G 7-34",

@@ -1,0 +1,185 @@
+"""A bright source beside a real star, from files to limits: is it found, and what does it cost?
+
+Run from the root of the project::
+
+    python -m benchmarks.neighbours FRAMES MAP -o neighbours.ecsv [--jobs N]
+
+FRAMES is the folder with the calints files of programme 1184. A source is added to both rolls of
+G 7-34 in F444W, as the fit of the untouched files renders it, and the changed files are reduced
+with the defaults. A row says whether both files were used as before, whether the source is among
+the companions of the fit and the candidates, its measured contrast and position, what else was
+found, and the ratio of the limits further than 1.5 lambda/D from it to those without it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import warnings
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from astropy.io import fits
+from astropy.table import Table
+from numpy.typing import NDArray
+
+import pyklip_diffrender as dr
+from benchmarks.provenance import provenance
+from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.io.files import write_table
+from pyklip_diffrender.scene.jwst_files import shift_frames
+
+NAMES = "jw0118400[56]001_03106_*calints.fits*"
+ANGLE = 110.0
+CASES = (
+    (1e-4, 0.6), (1e-4, 1.2), (1e-3, 0.4), (1e-3, 1.2), (1e-3, 2.0), (1e-2, 0.6), (1e-2, 1.2),
+    (1e-2, 2.0), (0.1, 0.4), (0.1, 0.8), (0.1, 1.5), (0.1, 2.2),
+)  # fmt: skip
+"""Contrasts, and separations in arcsec."""
+
+
+def light_of(reduction: dr.Reduction, contrast: float, separation: float) -> list[NDArray[Any]]:
+    """The source in the fitted square of each roll, (ny, nx)."""
+    frames = reduction.fit.frames
+    planet = dr.Planet(contrast, separation, ANGLE)
+    lights = []
+    for frame in frames:
+        roll = frame.observation.roll_from(frames[0].observation)
+        x, y = frame.values["star_offset"] + planet.rotated(roll).offset
+        light = frame.render(background=False, source=(float(x), float(y)))
+        lights.append(contrast * np.asarray(light).reshape(light.shape[-2:]))
+    return lights
+
+
+def with_source(
+    paths: list[Path], folder: Path, sequence: dr.Sequence, lights: list[NDArray[Any]]
+) -> None:
+    """Write the files with the light added, shifted as the alignment has shifted the frames.
+
+    Parameters
+    ----------
+    paths : list of Path
+        Of the two rolls.
+    folder : Path
+        For the changed files.
+    sequence : Sequence
+        The untouched frames, on the pixels of the detector.
+    lights : list of ndarray, (ny, nx)
+        See `light_of`.
+    """
+    size = lights[0].shape[-1]
+    windows, _ = sequence.windows((size, size))
+    for path, frame, window, light in zip(paths, sequence.science, windows, lights, strict=True):
+        with fits.open(path) as hdus:
+            science = hdus["SCI"]
+            stated = np.array([science.header[key] - 1 for key in ("CRPIX1", "CRPIX2")])
+            whole = np.zeros((1, *science.shape[1:]))
+            box = np.s_[:, window.y : window.y + size, window.x : window.x + size]
+            whole[box] = light
+            science.data += shift_frames(whole, (stated - frame.center[0])[None])
+            hdus.writeto(folder / path.name.removesuffix(".gz"))
+
+
+def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]) -> dict[str, Any]:
+    """Reduce the files with one source."""
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    contrast, separation = case
+    row: dict[str, Any] = {"contrast": contrast, "separation": separation, "outcome": "as before"}
+    paths = sorted(frames.glob(NAMES))
+    sequence = dr.Sequence.from_files(paths)
+    with tempfile.TemporaryDirectory() as place:
+        lights = [contrast * light for light in base["light"][separation]]
+        with_source(paths, Path(place), sequence, lights)
+        try:
+            changed = dr.Sequence.from_files(place)
+        except DiffrenderError as error:
+            return row | {"outcome": f"refused: {error}"}
+        if changed.excluded or len(changed.science) != len(sequence.science):
+            row["outcome"] = f"excluded: {changed.excluded}"
+        elif [each.first_pixel for each in changed.science] != base["first"]:
+            row["outcome"] = "another first_pixel"
+        try:
+            reduction = dr.reduce(changed, opd)
+        except DiffrenderError as error:
+            return row | {"outcome": f"no fit: {error}"}
+    detection = reduction.detection
+    north = detection.north
+    angle = np.deg2rad(ANGLE)
+    place_ = separation * np.array([-np.sin(angle), np.cos(angle)])
+    x, y = np.moveaxis(detection.grid, -1, 0)
+    away = np.hypot(x - place_[0], y - place_[1])
+    resolution = reduction.fit.model.resolution
+    distance = np.hypot(x, y)
+    far = (away > 1.5 * resolution) & (distance > 0.3) & np.isfinite(detection.error)
+    error = detection.error * detection.error_factor.of(detection.grid)
+    flux = reduction.fit.frames[0].flux
+    ratio = (flux * error / base["error"])[far]
+    found = false = 0
+    for candidate in detection.candidates:
+        position = candidate["position_angle"].to_value("deg") - north
+        r = candidate["separation"].to_value("arcsec")
+        there = r * np.array([-np.sin(np.deg2rad(position)), np.cos(np.deg2rad(position))])
+        if np.hypot(*(there - place_)) < 0.5 * resolution:
+            found += 1
+            measured = float(candidate["contrast"]) * flux / base["flux"]
+            row["measured"] = measured / contrast
+            row["pull"] = (measured - contrast) / (
+                float(candidate["contrast_error"]) * flux / base["flux"]
+            )
+            row["off_mas"] = 1e3 * float(np.hypot(*(there - place_)))
+        else:
+            false += 1
+    scatter = np.nanstd(np.clip(detection.residual_snr[far], -5, 5))
+    return row | {
+        "status": reduction.fit.status.name, "chi2": float(reduction.fit.chi2_per_pixel),
+        "star": flux / base["flux"], "found": found, "false": false,
+        "companions": len(reduction.fit.planets),
+        "limits": float(np.nanmedian(ratio)), "limits_90": float(np.nanpercentile(ratio, 90)),
+        "limits_10": float(np.nanpercentile(ratio, 10)), "scatter": float(scatter),
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Reduce the untouched files and those with each source."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("frames", type=Path)
+    parser.add_argument("map", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--cases", nargs="+", metavar="CONTRAST,ARCSEC", help="instead of all")
+    options = parser.parse_args()
+    cases: list[tuple[float, float]] = list(CASES)
+    if options.cases:
+        pairs = (case.split(",") for case in options.cases)
+        cases = [(float(contrast), float(separation)) for contrast, separation in pairs]
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    sequence = dr.Sequence.from_files(sorted(options.frames.glob(NAMES)))
+    untouched = dr.reduce(sequence, options.map)
+    detection, frames = untouched.detection, untouched.fit.frames
+    base = {
+        "first": [each.first_pixel for each in sequence.science],
+        "flux": frames[0].flux,
+        "error": frames[0].flux * detection.error * detection.error_factor.of(detection.grid),
+        "light": {each: light_of(untouched, 1.0, each) for each in {r for _, r in cases}},
+    }
+    work = partial(one, options.frames, options.map, base)
+    rows = []
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(work, cases):
+            print(row, flush=True)
+            rows.append(row)
+            names = list(dict.fromkeys(name for row in rows for name in row))
+            table = Table(rows=[{name: row.get(name, np.nan) for name in names} for row in rows])
+            table.meta = {"provenance": provenance("python -m benchmarks.neighbours FRAMES MAP")}
+            write_table(table, options.output)
+
+
+if __name__ == "__main__":
+    main()
