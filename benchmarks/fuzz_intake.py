@@ -306,7 +306,7 @@ def main() -> None:
     table = _counts(records)
     table.pprint_all()
     if options.table is not None:
-        command = f"python -m benchmarks.fuzz_intake --count {options.count}"
+        command = f"-m benchmarks.fuzz_intake --count {options.count}"
         if options.frames is not None:
             command += " --frames FRAMES"
         table.meta = {"provenance": provenance(command)}

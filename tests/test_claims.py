@@ -210,6 +210,11 @@ CLAIMS = (
     Claim("README.md", "a contrast of {:.2f}e-4 +- {:.2f}e-4 (published: {:.2f}e-4 +- {:.2f}e-4)",
           lambda: [*companion("contrast of the companion", 1e4),
                    *companion("published contrast", 1e4)]),
+    # -- intake
+    Claim("docs/howto/real_frames.md", "segments), {:.0f} are used entirely, from {:.0f} "
+          "some files are excluded with a reason, and {:.0f} are refused",
+          lambda: [float(table("intake")[name][-1])
+                   for name in ("as untouched", "excluded", "refused")]),
     # -- resources
     Claim("docs/howto/resources.md", "814 integrations, takes {:.2f} times its size",
           lambda: [stated("memory of reading over the size of the file", setting="1 GB")]),
