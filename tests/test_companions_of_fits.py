@@ -84,6 +84,7 @@ def test_a_planet_that_ends_a_fit_at_a_wrong_wavefront_is_found(seed, cycles):
     assert abs(outcome.pull) < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contrast", [0.0, 1e-3])
 def test_a_companion_that_was_an_error_of_the_wavefront_is_dropped(contrast, caplog):
     """The alignment alone leaves peaks, which the wavefront explains; a planet stays."""

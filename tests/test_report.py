@@ -329,6 +329,7 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
     assert "http" not in " ".join(page.words)
 
 
+@pytest.mark.slow
 def test_a_header_cannot_write_into_the_page(tmp_path):
     whole = reduction()
     frame = whole.sequence.science[0]
@@ -433,6 +434,7 @@ def test_images_of_the_sky_are_written_with_coordinates(tmp_path):
         assert 0.5 < noise / np.nanmedian(whole.detection.observation.error) < 2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_few_pictures")
 @pytest.mark.parametrize("count", [1, 4])
 def test_injected_planets_have_a_section(tmp_path, count):

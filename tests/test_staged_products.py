@@ -78,6 +78,7 @@ def test_an_interrupted_reduction_leaves_fit_and_search(stopped):
         ProductFolder(folder)
 
 
+@pytest.mark.slow
 def test_a_resumed_reduction_does_not_fit_again(stopped, tmp_path, monkeypatch):
     prepared, before = stopped
     for path in before.iterdir():

@@ -352,6 +352,7 @@ def fits_of_a_map(folder):
     return "opd.fits"
 
 
+@pytest.mark.slow
 def test_a_reference_star_in_place_of_a_map_makes_limits_deeper():
     star = fitted_reference()
     begun = pipeline.prepare(sequence(reference(0), reference(4)), star, ReduceOptions(size=SIZE))

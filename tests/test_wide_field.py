@@ -96,6 +96,7 @@ def crowded_field(crowded):
     return wide_field(detection, [frame])
 
 
+@pytest.mark.slow
 def test_an_extended_source_is_one_row_with_its_shape(crowded_field):
     table = crowded_field.candidates
     table = table[np.isfinite(table["fit_chi2"])]
