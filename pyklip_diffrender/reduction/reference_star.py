@@ -83,7 +83,7 @@ class ReferenceStar:
     >>> frame = dr.simulate(model, dr.Scene(), opd, seed=1)
     >>> fit = dr.refine(model, [frame], opd, settings=dr.GaussNewton(cycles=4))
     >>> dr.ReferenceStar.of(fit).frames
-    ('simulated',)
+    ('simulation(seed=1)',)
     """
 
     wavefront: OPDMap
@@ -98,7 +98,8 @@ class ReferenceStar:
     start: str = ""
 
     def __repr__(self) -> str:
-        return f"<ReferenceStar {self.star!r}: {self.filter}, {len(self.frames)} frames>"
+        count = f"{len(self.frames)} frame{'' if len(self.frames) == 1 else 's'}"
+        return f"<ReferenceStar {self.star!r}: {self.filter}, {count}>"
 
     def _repr_html_(self) -> str:
         date = self.wavefront.date
