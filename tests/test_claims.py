@@ -216,8 +216,8 @@ CLAIMS = (
           lambda: [float(table("intake")[name][-1])
                    for name in ("as untouched", "excluded", "refused")]),
     # -- resources
-    Claim("docs/howto/resources.md", "814 integrations, takes {:.2f} times its size",
-          lambda: [stated("memory of reading over the size of the file", setting="1 GB")]),
+    Claim("docs/howto/resources.md", "3255 integrations, takes {:.2f} times its size",
+          lambda: [stated("memory of reading over the size of the file", setting="4 GB")]),
     Claim("docs/howto/resources.md", "reading takes {:.1f} times the file (`--dataset",
           lambda: [stated("memory of reading over the size of the file",
                           setting="pyKLIP dataset, 0.2 GB")]),
