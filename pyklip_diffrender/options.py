@@ -203,12 +203,12 @@ class SharedOptions:
     })  # fmt: skip
     references: References = field(default="joint", metadata={
         "choices": get_args(References),
-        "meaning": """What the frames of reference stars are for. With "joint" they are fitted
-            together with the target's, in one likelihood, if that makes the limits deeper; with
-            "pattern" they teach the flat-field pattern where the library has none; with "off" they
-            are not used. With `disk`, "joint" stands for "pattern".""",
-        "help": """What the frames of reference stars are for: one likelihood with the target's, the
-            flat-field pattern, or nothing.""",
+        "meaning": """Use of the frames of reference stars. With "joint" they are fitted together
+            with the target's, in one likelihood, if that makes the limits deeper; with "pattern"
+            they teach the flat-field pattern where the library has none; with "off" they are not
+            used. With `disk`, "joint" stands for "pattern".""",
+        "help": """Use of the frames of reference stars: in one likelihood with the target's, for
+            the flat-field pattern, or not at all.""",
     })  # fmt: skip
     threshold: float = field(default=5.0, metadata={
         "meaning": "S/N of a candidate.", "help": "S/N of a candidate.", "metavar": "S/N",

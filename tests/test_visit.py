@@ -371,6 +371,23 @@ def test_a_reference_star_in_place_of_a_map_makes_limits_deeper():
     assert abs(found["contrast"] - PLANET.contrast) < 3 * found["contrast_error"]
 
 
+@pytest.mark.parametrize("accuracy", ["full", "quick"])
+def test_settings_about_a_reference_star_are_those_of_the_options(accuracy):
+    star = fitted_reference()
+    usual, begun = (
+        pipeline.prepare(sequence(), each, ReduceOptions(size=SIZE, accuracy=accuracy))
+        for each in (OPD, star)
+    )
+    assert begun.settings.prior.scales["segment"] < 2
+    if accuracy == "quick":
+        assert begun.settings.cycles == usual.settings.cycles
+        assert begun.settings.tolerance == usual.settings.tolerance
+    # Settings that are given are not changed; the pattern is used with them as well.
+    own = pipeline.prepare(sequence(), star, ReduceOptions(size=SIZE, settings=SETTINGS))
+    assert own.settings is SETTINGS
+    assert isinstance(own.options.systematics, dr.Systematics)
+
+
 def test_the_prior_about_a_reference_star_grows_with_the_days():
     star = fitted_reference()
     usual = GaussNewton.nircam("F444W").prior.scales["segment"]
@@ -391,6 +408,10 @@ def test_the_prior_about_a_reference_star_grows_with_the_days():
         ({"header": {"CORONMSK": "MASKA430R"}}, "got the mask MASK430R, expected MASK335R"),
         ({"header": {"DETECTOR": "NRCA2"}}, "got the detector NRCA2, expected NRCALONG"),
         ({"name": "HD 2 4"}, "one of the frames that the reference star HD 2 was fitted to"),
+        (
+            {"name": "copy.fits", "date": Time("2022-10-03T04:00")},
+            "copy.fits is one of the frames",
+        ),
     ],
 )
 def test_a_reference_star_of_other_frames_is_refused(changes, message):

@@ -11,7 +11,7 @@ from astropy.table import QTable
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import wide_field
-from pyklip_diffrender.detection.wide_search import WholeFrame
+from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 WHOLE, FITTED = 120, 48

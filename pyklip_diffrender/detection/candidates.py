@@ -642,7 +642,7 @@ _THRESHOLD = 6.0
 """S/N above which a peak is a source. Fainter ones leave less than a fifth of it in the target."""
 
 _WORTH_A_LOOK = 4.5
-"""The same for an approximate S/N, in units of its scatter."""
+"""Approximate S/N, in units of its scatter, above which a peak is looked at more closely."""
 
 _SAME_ROLL = 1.0
 """Degrees between frames whose sources are at the same pixels."""

@@ -181,7 +181,7 @@ class Combination:
         return scales_of(self.maps, self.unit)
 
     def to_dict(self) -> dict[str, Any]:
-        """What the search says as plain values for JSON; names end in the unit of their values."""
+        """Return the search as plain values for JSON; names end in the unit of their values."""
         return {
             "target": self.target,
             "filters": list(self.spectra.filters),

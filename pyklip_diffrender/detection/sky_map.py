@@ -61,7 +61,7 @@ LIGHT = 1.5
 
 @dataclass(frozen=True, eq=False)
 class SkyMap:
-    """What one reduction says of point sources at every place."""
+    """Maps of the flux of a point source at every place, and its error, from one reduction."""
 
     name: str
     filter: str
@@ -374,7 +374,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """What is said of a source by the epochs.
+    """Probabilities of three hypotheses about a source, given its places at several epochs.
 
     Attributes
     ----------

@@ -239,7 +239,7 @@ def prepare(
         for each in sequence.science:
             reference.require_setup_of(each)
         # What its frames say is in the prior already.
-        others = tuple(each for each in sequence.references if each.name not in reference.frames)
+        others = tuple(each for each in sequence.references if not reference.has(each))
         sequence, opd = replace(sequence, references=others), reference.wavefront
     wavefront = wavefront_for(opd, sequence.date)
     if options.star_flux is not None:
@@ -261,12 +261,14 @@ def prepare(
         cut = sequence.cutout(options.size)
     else:
         cut = sequence.cutout(model.detector.shape, beyond_edges=True)
-    if reference is not None and settings is None:
-        settings = reference.settings_for(cut.science[0])
-        pattern = reference.pattern_for(cut.science[0])
-        if pattern is not None and options.systematics == "auto":
+    if reference is not None:
+        is_open = options.systematics == "auto"
+        pattern = reference.pattern_for(cut.science[0]) if is_open else None
+        if options.settings is None:  # Whoever gives settings has chosen the prior.
+            settings = reference.settings_for(cut.science[0], settings)
+            settings = settings if pattern is None else with_known_pattern(settings)
+        if pattern is not None:
             options = replace(options, systematics=pattern)
-            settings = with_known_pattern(settings)
     return Preparation(sequence, cut, model, wavefront, options, settings)
 
 

@@ -43,7 +43,7 @@ _DAILY = 1.75
 (Feng et al. 2025, section 4), of which 2.7 nm are those of `slew_drift`."""
 
 _NEW = 14.0
-"""Days after which a wavefront says no more than any other map: mirrors may have been moved."""
+"""Days after which a wavefront is taken for a map like any other: mirrors may have been moved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,13 +148,16 @@ class ReferenceStar:
             start=fit.initial.name,
         )
 
-    def settings_for(self, observation: Observation) -> GaussNewton:
+    def settings_for(
+        self, observation: Observation, usual: GaussNewton | None = None
+    ) -> GaussNewton:
         """Return the settings of a fit that starts from this wavefront.
 
-        The prior is that of the drift from one star to the next, which grows by 1.75 nm rms a day,
-        up to the usual one about a map. It is widened where the frames ask for it.
+        They are the usual ones, default those of `refine`, but for the prior, which is that of
+        the drift from one star to the next. It grows by 1.75 nm rms a day, up to the usual one
+        about a map, and is widened where the frames ask for it.
         """
-        usual = settings_for(observation)
+        usual = settings_for(observation) if usual is None else usual
         date, sensed = observation.date, self.wavefront.date
         days = 0.0 if date is None or sensed is None else abs(float((date - sensed).jd))
         prior = slew_drift(_DAILY * days)
@@ -169,6 +172,12 @@ class ReferenceStar:
         """
         patterns = self.patterns.matching(observation)
         return combine_patterns(patterns) if len(patterns) > 1 else None
+
+    def has(self, observation: Observation) -> bool:
+        """Whether an observation is of one of the exposures that were fitted, by name or date."""
+        dates = {each.date for each in self.patterns.patterns if each.date}
+        date = observation.date
+        return observation.name in self.frames or (date is not None and date.isot in dates)
 
     def require_setup_of(self, observation: Observation) -> None:
         """Raise for frames that this star says nothing of.
@@ -187,7 +196,7 @@ class ReferenceStar:
                     f"{name}: got the {what} {there}, expected {here}, that of the reference star "
                     f"{self.star}"
                 )
-        if name in self.frames:
+        if self.has(observation):
             raise IncompatibleSetupError(
                 f"{name} is one of the frames that the reference star {self.star} was fitted to, "
                 "expected frames of another star. Give a wavefront map"

@@ -1,0 +1,344 @@
+"""A frame of the target beyond the fitted pixels: background, noise, and matched filter."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from astropy.stats import SigmaClip
+from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
+from numpy.typing import NDArray
+from scipy.ndimage import convolve, map_coordinates
+from scipy.signal import fftconvolve
+
+from pyklip_diffrender.detection.field import (
+    Image,
+    pixels_of,
+    separation_of,
+)
+from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.refinement import FrameFit
+from pyklip_diffrender.refinement.fit_result import pixel_grid
+from pyklip_diffrender.scene.observation import Observation
+
+if TYPE_CHECKING:
+    from photutils.psf import ImagePSF
+
+__all__ = ["EDGE", "REACH", "WholeFrame"]
+
+
+EDGE = 16
+"""Pixels within the last valid rows and columns that are not searched: templates are cut off there,
+and light scattered by the edge of the occulters' substrate appears in the first rows of every
+frame."""
+
+_FAR = 4.0
+"""Separation of the source whose image is taken for all sources far from the star, arcsec. The
+occulter takes less than a percent of its light."""
+
+_KERNEL = 15
+"""Side of that image in the matched filter, pixels."""
+
+REACH = 81
+"""Side of the image that is subtracted for a source: it has side lobes far from its middle."""
+
+_FINE = 4
+"""Positions per pixel, along x and y, at which it is rendered for photometry."""
+
+_BOX = 32
+"""Side of the boxes in which the background is estimated, pixels."""
+
+_CORE = 2.0
+"""arcsec; closer to the star its residual is no background."""
+
+_OUTLIER = 5.0
+"""Standard deviations by which a pixel is brighter than its neighbours allow if it is masked."""
+
+_NOT_CONVERGED = 8
+"""Flag of photutils for a fit that has not converged."""
+
+_FITTED = 9
+"""Side of the square in which a source is fitted, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class WholeFrame:
+    """A whole frame with the fitted star and the background removed."""
+
+    fit: FrameFit  # Of the star in the pixels about it.
+    observation: Observation  # The whole frame, of which the fit has a part.
+    roll: float  # Rotation of the sky from the first frame to this one, degrees.
+    # (k, 3), contrast, and x, y from the star in the first frame, of the sources that were found in
+    # the fitted pixels. They are removed as well.
+    candidates: Image = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @cached_property
+    def grid(self) -> Image:
+        """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
+        return pixel_grid(*self.fit.on_pixels(self.observation.shape, self._center))
+
+    @property
+    def _center(self) -> tuple[float, float]:
+        x, y = self.observation.center[0]
+        return float(x), float(y)
+
+    @cached_property
+    def _bounds(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First and last column, and row, of which at least half of the pixels are valid."""
+        valid = self.observation.combined().valid[0]
+        lines = [np.flatnonzero(valid.mean(axis=axis) >= 0.5) for axis in (0, 1)]
+        columns, rows = ((int(k[0]), int(k[-1])) if len(k) else (0, -1) for k in lines)
+        return columns, rows
+
+    def searches(self, offsets: Image) -> NDArray[np.bool_]:
+        """Whether positions x, y from the star in the first frame, (..., 2), are searched."""
+        pixels = self.pixels_of(np.asarray(offsets, dtype=float))
+        # Half a pixel further, their centres are still nearest to a searched pixel.
+        inside = [
+            (pixels[..., k] >= first + EDGE - 0.5) & (pixels[..., k] <= last - EDGE + 0.5)
+            for k, (first, last) in enumerate(self._bounds)
+        ]
+        return np.asarray(inside[0] & inside[1])
+
+    @cached_property
+    def stars(self) -> Image:
+        """Image of the star and of the candidates, without background, (ny, nx)."""
+        shape, center = self.observation.shape, self._center
+        image = self.fit.render(shape, center, background=False)
+        star = self.fit.values.get("star_offset", np.zeros(2))
+        for contrast, *offset in self.candidates:
+            x, y = star + self._turn @ offset
+            image += contrast * self.fit.render(shape, center, background=False, source=(x, y))
+        return image
+
+    @cached_property
+    def residual(self) -> Image:
+        """Data without star, candidates and background, (ny, nx); 0 where masked."""
+        # Imported where it is used, because it imports matplotlib.
+        from photutils.background import Background2D, MedianBackground
+
+        combined = self.observation.combined()
+        image = np.asarray(combined.data[0] - self.stars)
+        separation = separation_of(self.grid)
+        # Of a small frame, its outer part.
+        core = min(_CORE, 0.7 * float(separation.max()))
+        unused = ~combined.valid[0] | (separation < core)
+        ground = Background2D(
+            np.where(combined.valid[0], image, 0.0),
+            _BOX,
+            mask=unused,
+            exclude_percentile=90.0,
+            sigma_clip=SigmaClip(sigma=3.0),
+            bkg_estimator=MedianBackground(),
+        ).background
+        return np.where(combined.valid[0], image - ground, 0.0)
+
+    @cached_property
+    def sigma(self) -> Image:
+        """Standard deviation of the noise, (ny, nx); inf where masked, and in outliers."""
+        combined = self.observation.combined()
+        sigma = np.where(combined.valid[0], combined.error[0], np.inf)
+        middle = _KERNEL // 2
+        cross = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
+        window = (slice(middle - 1, middle + 2),) * 2
+        # An outlier is brighter than its neighbours allow: of all positions of a source, that in
+        # the middle of a pixel leaves the neighbours least of its light, a mean of `share` of the
+        # peak. A pixel may therefore have the mean of its neighbours over `share`, whose variance
+        # is that of a pixel over 4 share^2.
+        share = (self.kernel[window] * cross).sum() / self.kernel[middle, middle]
+        allowed = np.maximum(convolve(self.residual, cross), 0.0) / share
+        uncertain = _OUTLIER * combined.error[0] * math.sqrt(1 + 0.25 / share**2)
+        # Residuals of the star are sharper than sources, too.
+        outlier = (self.residual > allowed + uncertain) & (separation_of(self.grid) > _CORE)
+        return np.where(outlier, np.inf, sigma)
+
+    def _source(self, size: int, x: float = 0.0, y: float = 0.0) -> Image:
+        """Source of contrast 1 far from the star, x, y pixels right of and above the middle."""
+        model, values = self.fit.on_pixels(size)
+        scale = np.array(model.detector.pixelscale)
+        far = torch.tensor([_FAR, 0.0], dtype=torch.float64)
+        values["star_offset"] = far
+        values["detector_shift"] = torch.from_numpy(np.array([x, y]) * scale) - far
+        with torch.no_grad():
+            image = model(torch.from_numpy(np.ascontiguousarray(self.fit.opd)), **values)
+        return np.asarray(self.fit.flux * image.double().cpu().numpy())
+
+    @cached_property
+    def kernel(self) -> Image:
+        """Image of a source of contrast 1 in the middle of a square of pixels."""
+        return self._source(_KERNEL)
+
+    @cached_property
+    def _fine(self) -> Image:
+        """The kernel, larger and sampled more finely than the pixels."""
+        fine = np.empty((_FINE * REACH, _FINE * REACH))
+        middle = (_FINE - 1) / 2
+        for row in range(_FINE):
+            for column in range(_FINE):
+                # A pixel right of the source's middle sees what a source to its left shows.
+                moved = self._source(REACH, (middle - column) / _FINE, (middle - row) / _FINE)
+                fine[row::_FINE, column::_FINE] = moved
+        return fine
+
+    @cached_property
+    def fine_image(self) -> ImagePSF:
+        """The fine image as a model for photutils."""
+        from photutils.psf import ImagePSF
+
+        return ImagePSF(self._fine, oversampling=_FINE)
+
+    @cached_property
+    def correlation(self) -> Image:
+        """Autocorrelation of the S/N of noise, by distance in pixels."""
+        image = fftconvolve(self.kernel, self.kernel[::-1, ::-1])
+        middle, reach = _KERNEL - 1, _KERNEL // 2
+        near = slice(middle - reach, middle + reach + 1)
+        return np.asarray(image[near, near] / image[middle, middle])
+
+    @cached_property
+    def starlight(self) -> Image:
+        """Star over noise, averaged with the squared S/N that a source has in each pixel."""
+        weight, squares = self.sigma**-2.0, self.kernel[::-1, ::-1] ** 2
+        ratio = np.where(weight > 0, self.stars / self.sigma, 0.0)
+        light, total = (
+            fftconvolve(each, squares, mode="same") for each in (weight * ratio, weight)
+        )
+        return np.asarray(np.maximum(light, 0) / np.maximum(total, 1e-300))
+
+    def products(self, image: Image) -> tuple[Image, Image]:
+        """Template times image and template times template, over the variance, at every pixel."""
+        weight = self.sigma**-2.0
+        # The template's weighted mean m is removed, so that a level that is constant over it does
+        # not matter: sum w d (t - m) and sum w (t - m)^2 with m = sum w t / sum w.
+        source = self.kernel[::-1, ::-1]
+        flat = np.ones_like(source)
+
+        def around(values: Image, kernel: Image) -> Image:
+            return np.asarray(fftconvolve(values, kernel, mode="same"))
+
+        total = np.maximum(around(weight, flat), 1e-300)
+        mixed = around(weight, source)
+        numerator = around(image * weight, source)
+        numerator -= around(image * weight, flat) * mixed / total
+        information = around(weight, source**2) - mixed**2 / total
+        return numerator, np.maximum(information, 0.0)
+
+    def pixels_of(self, offsets: Image) -> Image:
+        """Columns and rows, (..., 2), of positions x, y from the star in the first frame."""
+        return pixels_of(self.grid, offsets @ self._turn.T)
+
+    def offsets_of(self, pixels: Image) -> Image:
+        """x, y from the star in the first frame of columns and rows, (k, 2)."""
+        origin = self.grid[0, 0]
+        steps = np.stack([self.grid[0, 1] - origin, self.grid[1, 0] - origin], axis=1)
+        return np.asarray((origin + pixels @ steps.T) @ self._turn)
+
+    @property
+    def _turn(self) -> NDArray[np.float64]:
+        return rotation_matrix(self.roll)
+
+    def window_about(self, offset: Image, size: int) -> tuple[slice, slice]:
+        """Rows and columns of a square of pixels about x, y from the star in the first frame."""
+        middle = np.rint(self.pixels_of(offset)).astype(int)[::-1]
+        begin, end = np.maximum(middle - size // 2, 0), np.maximum(middle + size // 2 + 1, 0)
+        return slice(begin[0], end[0]), slice(begin[1], end[1])
+
+    def gaussian(self, window: tuple[slice, slice]) -> Callable[[Image, Image], Image]:
+        """Images of sources of contrast 1 with the shape of a Gaussian, in a window of pixels.
+
+        The function takes x, y from the star in the first frame, (2,), arcsec, and the covariance
+        of the Gaussian, (2, 2), arcsec^2 along the axes of the first frame; 0 for a point source.
+        """
+        ny, nx = self.observation.shape
+        rows, columns = np.arange(ny)[window[0]], np.arange(nx)[window[1]]
+        # Twice as wide as the window, so that its copies on all sides are not seen.
+        beyond = max(0, REACH - 2 * max(len(rows), len(columns)) - 1) // 2 * _FINE
+        fine = self._fine[beyond:-beyond, beyond:-beyond] if beyond else self._fine
+        side = len(fine)
+        # Cycles per pixel, along rows and columns.
+        ky, kx = np.fft.fftfreq(side, 1 / _FINE)[:, None], np.fft.rfftfreq(side, 1 / _FINE)
+        # The middle is between two samples.
+        middle = (side - 1) / 2 / _FINE
+        transform = np.fft.rfft2(fine) * np.exp(2j * np.pi * middle * (kx + ky))
+        origin = self.pixels_of(np.zeros(2))
+        to_pixels = (self.pixels_of(np.eye(2)) - origin).T
+
+        def image(offset: Image, covariance: Image) -> Image:
+            x, y = self.pixels_of(offset)
+            # The transform of a Gaussian of covariance S is exp(-2 pi^2 k S k), and that of a shift
+            # a phase.
+            (xx, xy), (_, yy) = 2 * np.pi**2 * to_pixels @ covariance @ to_pixels.T
+            smoothed = np.exp(-(xx * kx**2 + yy * ky**2 + 2 * xy * kx * ky))
+            along_x, along_y = (
+                np.exp(-2j * np.pi * k * (place - round(place))) for k, place in ((kx, x), (ky, y))
+            )
+            moved = np.fft.irfft2(transform * smoothed * along_x * along_y, s=fine.shape)
+            samples = [_FINE * (p - round(q)) % side for p, q in ((rows, y), (columns, x))]
+            return np.asarray(moved[np.ix_(*samples)])
+
+        return image
+
+    def on_first(self, grid: Image, images: Sequence[Image]) -> list[Image]:
+        """Images of this frame at the positions of the first frame's pixels; 0 outside it.
+
+        So are they where the last of the images is not positive after the interpolation.
+        """
+        if np.array_equal(grid, self.grid):
+            return list(images)
+        x, y = np.moveaxis(self.pixels_of(grid), -1, 0)
+        moved = [map_coordinates(each, [y, x], order=3, mode="constant") for each in images]
+        return [np.where(moved[-1] > 0, each, 0.0) for each in moved]
+
+    def light(self, offsets: Image, contrasts: Image) -> Image:
+        """Image of point sources at x, y from the star in the first frame, (ny, nx)."""
+        total = np.zeros(self.observation.shape)
+        ny, nx = total.shape
+        for (x, y), contrast in zip(self.pixels_of(offsets), contrasts, strict=True):
+            half = REACH // 2
+            rows = slice(max(round(y) - half, 0), min(round(y) + half + 1, ny))
+            columns = slice(max(round(x) - half, 0), min(round(x) + half + 1, nx))
+            if rows.start < rows.stop and columns.start < columns.stop:
+                row, column = np.mgrid[rows, columns]
+                total[rows, columns] += self.fine_image.evaluate(column, row, contrast, x, y)
+        return total
+
+    def photometry(
+        self, image: Image, offset: Image, contrast: float
+    ) -> tuple[Image, Image, float] | None:
+        """Fit a point source to an image, starting from its position and contrast.
+
+        Values and errors (3,) are contrast, and x, y from the star in the first frame, arcsec; the
+        third result is the reduced chi-squared. None if the source is not where this frame is
+        searched, before or after the fit, or if that fails.
+        """
+        from photutils.psf import PSFPhotometry
+
+        x, y = self.pixels_of(offset)
+        if not self.searches(offset) or np.isinf(self.sigma[round(y), round(x)]):
+            return None
+        start = QTable({"x": [x], "y": [y], "flux": [contrast]})
+        unused = np.isinf(self.sigma)
+        with warnings.catch_warnings():
+            # Of a fit that has not converged, which its flags say as well.
+            warnings.simplefilter("ignore", AstropyUserWarning)
+            fitted = PSFPhotometry(self.fine_image, (_FITTED, _FITTED))(
+                image, error=np.where(unused, 1.0, self.sigma), mask=unused, init_params=start
+            )[0]
+        if fitted["flags"] & _NOT_CONVERGED:
+            return None
+        place = self.offsets_of(np.array([fitted["x_fit"], fitted["y_fit"]], dtype=float))
+        values = np.array([fitted["flux_fit"], *place], dtype=float)
+        scale = self.fit.model.detector.pixelscale
+        variances = np.array([fitted["x_err"], fitted["y_err"]], dtype=float) ** 2
+        # Along the axes of the first frame, from which this one may be rolled.
+        turned = self._turn.T**2 @ (variances * np.square(scale))
+        errors = np.array([fitted["flux_err"], *np.sqrt(turned)], dtype=float)
+        usable = np.isfinite(values).all() and (errors > 0).all() and self.searches(place)
+        return (values, errors, float(fitted["reduced_chi2"])) if usable else None
