@@ -28,7 +28,7 @@ from pyklip_diffrender.cli.session import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.reduction import UNFINISHED, Preparation, ReduceOptions
+from pyklip_diffrender.reduction import UNFINISHED, Preparation, ProductFolder, ReduceOptions
 from pyklip_diffrender.wavefront.opd import random_opd, resample
 
 # The package has the command under the name of its module.
@@ -427,6 +427,7 @@ def reduced(monkeypatch):
         return made[-1]
 
     monkeypatch.setattr(Preparation, "run", stub)
+    monkeypatch.setattr(ProductFolder, "finish", lambda self, each: each.write(self.folder))
     return made
 
 

@@ -37,8 +37,8 @@ from pyklip_diffrender.reduction.pages import (
     write_figures,
 )
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
+from pyklip_diffrender.reduction.pipeline import looks_extended
 from pyklip_diffrender.reduction.products import page
-from pyklip_diffrender.reduction.reduction_result import looks_extended
 from pyklip_diffrender.refinement import Status
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)

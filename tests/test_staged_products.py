@@ -20,8 +20,8 @@ from pyklip_diffrender.reduction import (
     ReduceOptions,
     pipeline,
 )
+from pyklip_diffrender.refinement import coarse_arguments, faintness
 from pyklip_diffrender.refinement.settings import quick_settings, settings_for
-from pyklip_diffrender.scene.simulation import coarse_arguments, faintness
 
 POINTING = {"CRVAL1": 150.0, "CRVAL2": 30.0, "TARGPROP": "HD 1"}
 ROLL = 25.0

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyklip_diffrender.detection.candidates import Maps
 from pyklip_diffrender.detection.error_factor import Significance
 from pyklip_diffrender.detection.field import Image, curve_separations, far_from
-from pyklip_diffrender.detection.search import significance_of
+from pyklip_diffrender.detection.measurement import significance_of
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError

@@ -41,12 +41,12 @@ from pyklip_diffrender.scene.admission import (
     exclude_unusable,
     exposures_in,
     frames_by_star,
-    judge_frames,
     require_some,
 )
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
+from pyklip_diffrender.scene.sequence import judge_frames
 from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import wavefront_for

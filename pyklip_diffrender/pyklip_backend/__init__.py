@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.dataset_frames import observation_from_dataset
+from pyklip_diffrender.pyklip_backend.fitted_star import Fit, Subtraction, Subtractor
 from pyklip_diffrender.pyklip_backend.registration import (
     ALGORITHM,
     backend,
@@ -14,12 +15,7 @@ from pyklip_diffrender.pyklip_backend.registration import (
     register,
     unregister,
 )
-from pyklip_diffrender.pyklip_backend.subtract import (
-    Fit,
-    Subtraction,
-    Subtractor,
-    subtract_by_refinement,
-)
+from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 
 __all__ = [
     "ALGORITHM",

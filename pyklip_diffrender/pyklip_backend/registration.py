@@ -21,8 +21,12 @@ from pyklip_diffrender.pyklip_backend.backend_settings import (
 )
 from pyklip_diffrender.pyklip_backend.child import announce, spawned_beside_klip
 from pyklip_diffrender.pyklip_backend.dataset_frames import keeping_references, keeping_source
-from pyklip_diffrender.pyklip_backend.forward_model import ForwardReduction
-from pyklip_diffrender.pyklip_backend.klip_call import RESULTS, DatasetReduction, mark_filtered
+from pyklip_diffrender.pyklip_backend.klip_call import (
+    RESULTS,
+    DatasetReduction,
+    ForwardReduction,
+    mark_filtered,
+)
 from pyklip_diffrender.pyklip_backend.output_files import ReductionRecord
 from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 

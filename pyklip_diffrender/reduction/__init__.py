@@ -1,16 +1,16 @@
 """`reduce`: from a sequence of frames to planets, with a report."""
 
 from pyklip_diffrender.options import ReduceOptions
-from pyklip_diffrender.reduction.pipeline import Preparation, prepare, reduce
+from pyklip_diffrender.reduction.pipeline import Preparation, ReductionResult, prepare
 from pyklip_diffrender.reduction.products import (
     PRODUCTS,
     UNFINISHED,
     ProductFolder,
-    Reduction,
     existing_products,
     write_products,
     write_report,
 )
+from pyklip_diffrender.reduction.reduction import Reduction, reduce
 from pyklip_diffrender.reduction.reference_star import ReferenceStar
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
@@ -35,6 +35,7 @@ __all__ = [
     "ProductFolder",
     "ReduceOptions",
     "Reduction",
+    "ReductionResult",
     "ReferenceStar",
     "Visit",
     "by_star",

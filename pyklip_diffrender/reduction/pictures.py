@@ -31,7 +31,7 @@ from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.reduction.pages import Picture, number, plus_minus, scientific
-from pyklip_diffrender.reduction.reduction_result import ReductionResult
+from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 

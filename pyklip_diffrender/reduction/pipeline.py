@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol
 
+import numpy as np
 from astropy.table import QTable
+from numpy.typing import NDArray
+from scipy import stats
 
 from pyklip_diffrender.detection import (
     Detection,
@@ -28,10 +31,11 @@ from pyklip_diffrender.errors import (
     DiffrenderWarning,
     RefinementError,
 )
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.options import ReduceKeywords, ReduceOptions
+from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternChoice,
     as_request,
@@ -39,12 +43,12 @@ from pyklip_diffrender.pattern import (
     fit_with_pattern,
     with_known_pattern,
 )
-from pyklip_diffrender.reduction.products import Checkpoint, ProductFolder, Reduction
 from pyklip_diffrender.reduction.reference_star import reference_star_in
-from pyklip_diffrender.reduction.visit import Joined, rough_settings, with_references
+from pyklip_diffrender.reduction.visit import Joined, Visit, rough_settings, with_references
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
+    coarse_arguments,
     quick_settings,
     refine,
     refine_again,
@@ -55,14 +59,20 @@ from pyklip_diffrender.refinement import (
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.scene.simulation import coarse_arguments, model_for
+from pyklip_diffrender.scene.simulation import model_for
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
 __all__ = [
     "MAX_CHI2",
+    "Checkpoint",
+    "Keeper",
     "Preparation",
+    "ReductionResult",
+    "looks_extended",
+    "on_extended_light",
     "prepare",
-    "reduce",
+    "reduced_chi2",
     "require_plausible",
     "warn_of_status",
 ]
@@ -127,98 +137,208 @@ def warn_of_status(name: str, result: Refinement) -> None:
         )
 
 
+# Whether candidates are parts of extended light, such as a disk, rather than planets.
+
+_UNLIKELY = 0.01
+"""Probability below which unrelated sources are not taken to be arranged by chance."""
+
+_NEAR = 1.5
+"""Separation of neighbours, lambda/D: one extended source is found as several this close."""
+
+
+def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
+    """Say how candidates are arranged like extended light; empty if they may be so by chance.
+
+    `candidates` has x and y from the star, and frame_angle; `resolution` is lambda/D and `edge` the
+    largest separation that was searched, arcsec.
+    """
+    # Sources that have nothing to do with each other have independent position angles, and are
+    # spread evenly over the field. The number of candidates alone says nothing.
+    count = len(candidates)
+    if count < 2:
+        return ""
+    if count > 2:
+        axes = np.sort(candidates["frame_angle"].value % 180)
+        gaps = np.diff(axes, append=axes[0] + 180)
+        # All axes are in the arc that is left by the largest gap. The probability that n random
+        # axes are in an arc a of their circle, a < 1/2, is n a^(n - 1).
+        arc = 1 - gaps.max() / 180
+        if arc < 0.5 and count * arc ** (count - 1) < _UNLIKELY:
+            return "The candidates are in line with the star, like an edge-on disk"
+    places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
+    distances = np.hypot(*(places[:, None] - places).T)[np.triu_indices(count, 1)]
+    # Each of the n (n - 1) / 2 pairs is within reach of each other with the probability
+    # (reach / edge)^2, the ratio of two areas, so that their number is nearly Poisson's.
+    reach = _NEAR * resolution
+    expected = len(distances) * (reach / edge) ** 2
+    if stats.poisson.sf((distances < reach).sum() - 1, expected) < _UNLIKELY:
+        return "Candidates are next to each other, like parts of an extended source"
+    return ""
+
+
+def on_extended_light(candidates: QTable, offsets: NDArray[np.float64], resolution: float) -> str:
+    """Say which candidates lie on extended light that was fitted; empty if none does.
+
+    `candidates` has x, y and separation. `offsets` (k, 2) are x, y of the sources of the extended
+    light from the star; `resolution` is lambda/D, arcsec.
+    """
+    if not len(candidates) or not len(offsets):
+        return ""
+    places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
+    away = np.hypot(*np.moveaxis(places[:, None] - offsets, -1, 0)).min(axis=1)
+    near = np.sort(candidates["separation"].value[away < resolution])
+    if not len(near):
+        return ""
+    separations = ", ".join(f"{each:.2f}" for each in near)
+    return (
+        f"On the extended light, candidates at {separations} arcsec may be parts of it that its "
+        "fit has left."
+    )
+
+
+# The result of a reduction.
+
+_LARGE = 4.0
+"""Chi-squared per pixel above which more is missing than what real frames leave where the pattern
+of the flat field is known: at most 1.6 for stars without a disk, 5 to 32 for AU Mic."""
+
+_HOPELESS = 100.0
+"""Chi-squared per pixel that no disk explains: the star is misplaced, or the set-up is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReductionResult:
+    """Result of a reduction; `Reduction` documents its attributes, and writes them."""
+
+    sequence: Sequence
+    fit: Refinement
+    detection: Detection
+    references: tuple[Refinement, ...] = ()
+    systematics: Systematics | None = None
+    failed: tuple[tuple[str, str], ...] = ()
+    pattern: str = "none"
+    visit: Visit = field(default_factory=Visit)
+    wide: WideField | None = None
+    disk: Disk | None = None
+    injections: QTable | None = None
+    completeness: QTable | None = None
+    accuracy: str = ReduceOptions.accuracy
+
+    @property
+    def reference_frames(self) -> int:
+        """Number of frames of reference stars that the flat-field pattern was learned from."""
+        if self.systematics is None:
+            return 0
+        return sum(frame.observation.count for fit in self.references for frame in fit.frames)
+
+    @property
+    def remark(self) -> str:
+        """Advice about a poor fit, or about extended light; else empty."""
+        if self.fit.chi2_per_pixel > _HOPELESS:
+            return (
+                "The residual is so far above the noise that something basic is wrong: check that "
+                "the star is behind the mask where the header says, that filter and mask are those "
+                "of the header, that no frame is damaged, and the unit of the wavefront map."
+            )
+        if self.disk is not None:
+            resolution = self.detection.contrast_curve.meta["resolution_arcsec"]
+            return on_extended_light(self.detection.candidates, self.disk.offsets, resolution)
+        reason = self.extended
+        if not reason and self.systematics is not None and self.fit.chi2_per_pixel > _LARGE:
+            reason = "The residual is far above the noise, as it is where the star has a disk"
+        if not reason:
+            return ""
+        return f"{reason}: repeat the reduction with disk=True (--disk on the command line)."
+
+    @cached_property
+    def extended(self) -> str:
+        """How the candidates are arranged like extended light, such as a disk; else empty."""
+        curve = self.detection.contrast_curve
+        if self.disk is not None or not len(curve):
+            return ""
+        resolution = curve.meta["resolution_arcsec"]
+        edge = float(curve["separation"][-1].to_value("arcsec"))
+        return looks_extended(self.detection.candidates, resolution, edge)
+
+    @property
+    def _status(self) -> str:
+        """How the fit ended, and whether it was a first look."""
+        quick = " (quick: a first look with a coarser model)" if self.accuracy == "quick" else ""
+        return f"{self.fit.status}{quick}"
+
+    def __repr__(self) -> str:
+        return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
+
+    def __str__(self) -> str:
+        known = "none" if self.systematics is None else f"from {self.systematics.name}"
+        search = self.detection if self.wide is None else self.wide
+        return (
+            f"{self.sequence!r}\n{self._status}\n"
+            f"flat-field pattern: {known}\n{self._references}{search}\n{self.remark}"
+        ).rstrip()
+
+    @property
+    def _references(self) -> str:
+        """What the frames of reference stars are for, in a line; empty without any."""
+        every = self.visit.contributions
+        used = sum(each.use == "joint" for each in every)
+        if not every:
+            return ""
+        deeper = f"; limits {self.visit.gain:.2f} times deeper" if used else ""
+        return f"reference frames in the likelihood: {used} of {len(every)}{deeper}\n"
+
+    def _repr_html_(self) -> str:
+        facts = {
+            "Status": self._status,
+            "Frames": f"{len(self.sequence.science)} of the target, "
+            f"{len(self.sequence.references)} of reference stars",
+            "Filter": self.sequence.filter,
+            "Flat-field pattern": "none" if self.systematics is None else self.systematics.name,
+        }
+        if self.remark:
+            facts["Remark"] = self.remark
+        head = html_summary(f"Reduction of {self.sequence.target}", facts)
+        return f"{head}\n{self.detection._repr_html_()}"
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """What a reduction that is resumed has done before."""
+
+    # Names of the stages: search, disk, wide, injections, completeness.
+    done: frozenset[str]
+    # Frames of reference stars that were fitted with the target's come after them.
+    fit: Refinement
+    detection: Detection
+    # What the frames of reference stars have contributed.
+    visit: Visit
+    # Of the fits of the target alone.
+    settings: GaussNewton | None
+    # The pattern of the target's own fit.
+    systematics: Systematics | None
+    # Where the pattern comes from, see `PatternChoice`, and the same with the names of its stars.
+    origin: Any
+    pattern: str
+    # Reference stars that could not be fitted, and why.
+    failed: tuple[tuple[str, str], ...]
+    disk: Disk | None
+    injections: QTable | None
+    completeness: QTable | None
+
+
+class Keeper(Protocol):
+    """What keeps the products of a reduction as they come, such as a `ProductFolder`."""
+
+    def begin(self, sequence: Sequence, opd: OPDMap, options: ReduceOptions) -> Checkpoint | None:
+        """Return what an interrupted reduction of the same frames has done; else None."""
+
+    def keep(self, stage_name: str, reduction: ReductionResult, choice: PatternChoice) -> None:
+        """Keep the products so far, after a stage."""
+
+
 # From a sequence of frames to planets: reference stars, pattern, joint fit, search.
 
 _log = logging.getLogger(__name__)
-
-
-def reduce(
-    sequence: Sequence | str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-    opd: Any,
-    *,
-    target: str | None = None,
-    filter: str | None = None,
-    progress: bool = False,
-    options: ReduceOptions | None = None,
-    output: str | os.PathLike[str] | None = None,
-    overwrite: bool = False,
-    resume: bool = False,
-    **keywords: Unpack[ReduceKeywords],
-) -> Reduction:
-    """Search a sequence of real frames for planets.
-
-    The flat-field pattern, the error of the model on the detector's pixels, comes from the
-    package's library or, where that has none, from fits of the sequence's reference stars. With
-    it, all frames of the target are fitted together and searched.
-
-    Parameters
-    ----------
-    sequence : Sequence, or files as for `Sequence.from_files`
-    opd : path, OPDMap, Quantity, array or "flat"
-        The wavefront to start from, as for `refine`. Of a folder of maps, the one nearest in time
-        to the target's frames is taken; see `choose_map` for other rules. "flat" is for frames
-        without a map: the fit then takes longer, and the star's flux is uncertain by 40 % unless
-        `star_flux` says it.
-    target, filter : str, optional
-        See `Sequence.from_files`.
-    progress : bool
-        Show progress bars.
-    options : ReduceOptions, optional
-        Options of the reduction, in place of `keywords`.
-    output : path, optional
-        Folder for the products, as those of `Reduction.write`. They are written as they come: those
-        of the fit and the search before wide, disk, injections and completeness begin.
-    overwrite : bool
-        Replace the products of an earlier reduction in `output`.
-    resume : bool
-        Go on with a reduction that was interrupted after its products in `output` were written
-        for the first time. Frames, map and options must be the same, but for injections and
-        completeness. What the frames of reference stars contributed (``Reduction.visit``) is kept;
-        fits of reference stars by themselves, for a pattern (``Reduction.references``), are not.
-    **keywords
-        Options by name, such as ``size=120``: the fields of `ReduceOptions`.
-
-    Returns
-    -------
-    Reduction
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For options that `ReduceOptions` refuses, and for `star_flux` with frames that are not
-        calibrated.
-    TypeError
-        For a keyword that is no option, or keywords together with `options`.
-    ExistingFileError
-        If there are products in `output`, and neither `overwrite` nor `resume` allows it; it is
-        also an `OSError`.
-    DiffrenderError
-        If the target cannot be fitted. A reference star that cannot be is left out.
-
-    Examples
-    --------
-    With frames and wavefront maps in folders, which the package does not contain:
-
-    >>> import pyklip_diffrender as dr
-    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
-    >>> print(result)  # doctest: +SKIP
-    """
-    if options is None:
-        options = ReduceOptions.from_keywords(keywords)
-    elif keywords:
-        raise TypeError(
-            f"reduce() got options and the keywords {', '.join(keywords)}, expected one of the two"
-        )
-    if not isinstance(sequence, Sequence):
-        sequence = Sequence.from_files(sequence, target=target, filter=filter)
-    if output is None:
-        if overwrite or resume:
-            raise TypeError("reduce() got overwrite or resume without output, a folder")
-        return prepare(sequence, opd, options).run(progress=progress)
-    products = ProductFolder(output, overwrite=overwrite, resume=resume)
-    reduction = prepare(sequence, opd, options).run(progress=progress, products=products)
-    products.finish(reduction)
-    return reduction
 
 
 def prepare(
@@ -286,7 +406,7 @@ class Preparation:
     # Of the fits; None for those of `refine`.
     settings: GaussNewton | None = None
 
-    def run(self, *, progress: bool = False, products: ProductFolder | None = None) -> Reduction:
+    def run(self, *, progress: bool = False, products: Keeper | None = None) -> ReductionResult:
         """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
 
         `products` gets the products as they come, and may have what an interrupted reduction has
@@ -302,9 +422,9 @@ class _Run:
 
     preparation: Preparation
     progress: bool
-    products: ProductFolder | None = None
+    products: Keeper | None = None
 
-    def result(self) -> Reduction:
+    def result(self) -> ReductionResult:
         options, whole = self.preparation.options, self.preparation.whole.science
         saved: Checkpoint | None = None
         detection: Detection | None = None
@@ -339,9 +459,9 @@ class _Run:
             disk, injections, fractions = saved.disk, saved.injections, saved.completeness
         sequence = replace(self.preparation.sequence, science=choice.science)
 
-        def reduction() -> Reduction:
+        def reduction() -> ReductionResult:
             assert detection is not None
-            return Reduction(
+            return ReductionResult(
                 sequence,
                 detection.fits[0],
                 detection,

@@ -33,11 +33,11 @@ from pyklip_diffrender.reduction.pages import (
     write_figures,
 )
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
-from pyklip_diffrender.reduction.reduction_result import ReductionResult
+from pyklip_diffrender.reduction.pipeline import Checkpoint, ReductionResult
 from pyklip_diffrender.reduction.reference_star import ReferenceStar
 from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.reduction.visit import Contribution, Visit
-from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.fit_file import decoded, encoded
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.systematics import Systematics
@@ -46,9 +46,7 @@ from pyklip_diffrender.wavefront.opd import OPDMap
 __all__ = [
     "PRODUCTS",
     "UNFINISHED",
-    "Checkpoint",
     "ProductFolder",
-    "Reduction",
     "existing_products",
     "page",
     "write_products",
@@ -323,116 +321,6 @@ def write_products(
     return written
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Reduction(ReductionResult):
-    """Result of `reduce`.
-
-    Attributes
-    ----------
-    sequence : Sequence
-        The frames, cut to the fitted pixels.
-    fit : Refinement
-        The fit that was searched: all frames of the target together, with the bright candidates in
-        the model, and without the light of a disk, if that was fitted.
-    detection : Detection
-    references : tuple of Refinement
-        One for each reference star that was fitted.
-    systematics : Systematics or None
-        The flat-field pattern that was used.
-    failed : tuple of (str, str)
-        Reference stars that could not be fitted, and why.
-    pattern : str
-        Origin of the flat-field pattern, with the names of its stars.
-    visit : Visit
-        What every frame of a reference star has contributed to the fit of the target.
-    wide : WideField or None
-        The search of the whole frames, if it was asked for.
-    disk : Disk or None
-        Extended light about the star, if it was asked for.
-    injections : QTable or None
-        Measurements of injected planets, see `recover_planets`, if they were asked for.
-    completeness : QTable or None
-        Fraction of planets that the search finds, see `completeness`, if it was asked for.
-    accuracy : str
-        "full", or "quick" for a first look, see `ReduceOptions`.
-
-    Examples
-    --------
-    With frames and wavefront maps in folders, which the package does not contain:
-
-    >>> import pyklip_diffrender as dr
-    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
-    >>> print(result.detection.candidates["separation", "contrast", "snr"])  # doctest: +SKIP
-    >>> result.write("products")  # doctest: +SKIP
-    """
-
-    def write(
-        self,
-        folder: str | os.PathLike[str],
-        *,
-        overwrite: bool = False,
-        derivatives: bool = False,
-        figures: Literal["pdf", "png", "svg"] | None = None,
-    ) -> list[Path]:
-        """Write maps, tables, the fit, the flat-field pattern, figures and a report.
-
-        Parameters
-        ----------
-        folder : path
-            Made if it does not exist.
-        overwrite : bool
-            Replace the products of an earlier reduction, and remove those that this one does not
-            have.
-        derivatives : bool
-            Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
-            space: they are needed to search the fit again (`detect`), and to measure at other
-            places (``Detection.read(...).measure``).
-        figures : {"pdf", "png", "svg"}, optional
-            Write every figure of the report to a file of this format in the folder ``figures``,
-            too. The report itself needs none of them.
-
-        Returns
-        -------
-        list of Path
-            The files that were written.
-
-        Raises
-        ------
-        ExistingFileError
-            If there are products in the folder, and `overwrite` is False; it is also an `OSError`.
-        IncompatibleSetupError
-            For another format of figures.
-        """
-        folder = Path(folder)
-        require_new(existing_products(folder), overwrite)
-        return write_products(self, folder, derivatives=derivatives, figures=figures)
-
-
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """What a reduction that is resumed has done before."""
-
-    # Names of the stages: search, disk, wide, injections, completeness.
-    done: frozenset[str]
-    # Frames of reference stars that were fitted with the target's come after them.
-    fit: Refinement
-    detection: Detection
-    # What the frames of reference stars have contributed.
-    visit: Visit
-    # Of the fits of the target alone.
-    settings: GaussNewton | None
-    # The pattern of the target's own fit.
-    systematics: Systematics | None
-    # Where the pattern comes from, see `PatternChoice`, and the same with the names of its stars.
-    origin: Any
-    pattern: str
-    # Reference stars that could not be fitted, and why.
-    failed: tuple[tuple[str, str], ...]
-    disk: Disk | None
-    injections: QTable | None
-    completeness: QTable | None
-
-
 class ProductFolder:
     """A folder into which a reduction writes its products as its stages end.
 
@@ -509,7 +397,7 @@ class ProductFolder:
             tables.get("completeness"),
         )
 
-    def keep(self, stage_name: str, reduction: Reduction, choice: PatternChoice) -> None:
+    def keep(self, stage_name: str, reduction: ReductionResult, choice: PatternChoice) -> None:
         """Write the products so far, after a stage."""
         self._facts["done"] = sorted({*self._facts["done"], stage_name})
         self._facts["choice"] = {
@@ -531,10 +419,10 @@ class ProductFolder:
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(self._facts, indent=2) + "\n", encoding="utf-8")
 
-    def finish(self, reduction: Reduction) -> list[Path]:
+    def finish(self, reduction: ReductionResult) -> list[Path]:
         """Write all products; the reduction has finished."""
-        return reduction.write(
-            self.folder, overwrite=True, derivatives=self._derivatives, figures=self._figures
+        return write_products(
+            reduction, self.folder, derivatives=self._derivatives, figures=self._figures
         )
 
 

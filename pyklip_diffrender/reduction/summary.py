@@ -19,7 +19,7 @@ from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction.pages import advice, sentence
-from pyklip_diffrender.reduction.reduction_result import ReductionResult
+from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.observation import Observation
 

@@ -16,6 +16,8 @@ from pyklip_diffrender.refinement.fitting import (
 )
 from pyklip_diffrender.refinement.settings import (
     GaussNewton,
+    coarse_arguments,
+    faintness,
     nircam_settings,
     quick_settings,
     settings_for,
@@ -27,6 +29,8 @@ __all__ = [
     "Refinement",
     "Status",
     "align_frame",
+    "coarse_arguments",
+    "faintness",
     "jansky_per_unit",
     "join_frames",
     "nircam_settings",

@@ -12,17 +12,24 @@ import numpy as np
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import stop_is_measured
+from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.units import ARCSEC, require_positive, to_bytes, to_unit
-from pyklip_diffrender.optics.grid import JWST_DIAMETER
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, samples_for_field
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.exposure import image_mask, module_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.simulation import faintness
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["GaussNewton", "nircam_settings", "quick_settings", "settings_for"]
+__all__ = [
+    "GaussNewton",
+    "coarse_arguments",
+    "faintness",
+    "nircam_settings",
+    "quick_settings",
+    "settings_for",
+]
 
 _REACH = 40
 """Pixels from the star to the edge of the square that `reduce` fits."""
@@ -53,6 +60,16 @@ _SWITCHES = (
     "accurate_steps",
 )  # fmt: skip
 """Fields of `GaussNewton` that are True or False."""
+
+_RING = (5.0, 16.0)
+_REFERENCE = 1800.0
+"""Median of the squared S/N of pixels at these distances from the star, pixels, in one roll of
+G 7-34 in F444W, for which `benchmarks.scene_fidelity` measured what a coarser model costs."""
+
+_VERY_FAINT = 100.0
+
+_COARSE_NPIX = 128
+"""Samples across the pupil for a first look, half of those of `model_for`."""
 
 _SHARES = ((100.0, 0.4), (4.0, 0.55), (0.0, 0.77))
 """Share of the spatial frequencies that a first look fits, by how many times the star is fainter
@@ -424,6 +441,33 @@ def settings_for(observation: Observation) -> GaussNewton:
     if not observation.is_nircam:
         return GaussNewton()
     return nircam_settings(observation, reach=max(_REACH, min(observation.shape) // 2))
+
+
+def faintness(observation: Observation) -> float:
+    """By what factor a star is fainter, compared with its noise, than G 7-34 in one roll."""
+    frame = observation.combined()
+    y, x = np.indices(frame.shape)
+    column, row = frame.center[0]
+    away = np.hypot(x - column, y - row)
+    ring = frame.valid[0] & (away > _RING[0]) & (away < _RING[1])
+    if not ring.any():
+        return 1.0
+    # The chi-squared of an error of the model that is a fraction of the light is proportional to
+    # (S/N)^2.
+    squares = (frame.data[0][ring] / frame.error[0][ring]) ** 2
+    return _REFERENCE / max(float(np.median(squares)), 1e-6)
+
+
+def coarse_arguments(observation: Observation, size: int) -> dict[str, Any]:
+    """Arguments of `model_for`, by the noise, for a first look at `size` x `size` pixels."""
+    nlambda = 3 if faintness(observation) >= _VERY_FAINT else 5
+    if observation.filter is None:
+        return {}
+    shortest = float(filter_throughput(observation.filter)[0][0])
+    npix = _COARSE_NPIX
+    while npix < samples_for_field(size * max(observation.pixelscale), shortest):
+        npix *= 2
+    return {"nlambda": nlambda, "npix": npix}
 
 
 def quick_settings(observation: Observation) -> GaussNewton:

@@ -21,10 +21,8 @@ from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, No
 from pyklip_diffrender.io.files import fits_files, open_fits, unpacked_name
 from pyklip_diffrender.io.headers import merged_header, same_name, unknown_name
 from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
-from pyklip_diffrender.scene.integrations import why_odd_noise
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.pixel_checks import copies, why_no_star, why_odd_unit
 
 __all__ = [
     "EPOCH",
@@ -33,14 +31,11 @@ __all__ = [
     "choose_filter",
     "choose_target",
     "epochs_of",
-    "exclude_contradicting",
-    "exclude_copies",
     "exclude_other_setups",
     "exclude_unoriented",
     "exclude_unusable",
     "exposures_in",
     "frames_by_star",
-    "judge_frames",
     "reasons_of",
     "require_agreement",
     "require_some",
@@ -214,18 +209,19 @@ def _is_map(hdu: Any) -> bool:
     return bool(hdu.is_image and unit.is_equivalent(u.m))
 
 
+Judge = Callable[[Iterable[FrameFile]], None]
+"""Reads files, and excludes those with wrong pixels, such as `sequence.judge_frames`."""
+
+
 def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:
     """Files that are not excluded."""
     return [each for each in files if not each.reason]
 
 
-def exclude_unusable(
-    files: Sequence[FrameFile], judge: Callable[[Iterable[FrameFile]], None]
-) -> None:
+def exclude_unusable(files: Sequence[FrameFile], judge: Judge) -> None:
     """Exclude files that cannot be frames of a star behind a mask, and duplicates.
 
-    `judge` reads files and excludes those with wrong pixels: of several files of one exposure, it
-    decides which is the best that can be used.
+    Of several files of one exposure, `judge` decides which is the best that can be used.
     """
     for each in admissible(files):
         each.reason = _why_unusable(each.exposure)
@@ -287,7 +283,7 @@ def _exclude_duplicates(
     files: Sequence[FrameFile],
     key: Callable[[FrameFile], object],
     reason: Callable[[FrameFile], str],
-    judge: Callable[[Iterable[FrameFile]], None] | None = None,
+    judge: Judge | None = None,
 ) -> None:
     """Keep the file of the best level among those with one key, of those that can be used."""
     groups: dict[object, list[FrameFile]] = {}
@@ -352,7 +348,7 @@ _TWO_STARS = 1.0
 """arcsec between stars with other names on one date that are not one star."""
 
 
-def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
+def choose_filter(files: Sequence[FrameFile], filter: str | None, judge: Judge) -> str:
     """Exclude frames of other filters; returns the one that is left.
 
     IncompatibleSetupError if none was chosen and there are several, or none of the chosen one;
@@ -363,7 +359,7 @@ def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
             each.reason = "the header does not say through which FILTER it was taken"
     require_some(files)
     if filter is None and len({each.exposure.filter for each in admissible(files)}) > 1:
-        judge_frames(files)
+        judge(files)
         require_some(files)
     filter = _the_only("filter", filter, [each.exposure.filter for each in admissible(files)])
     for each in admissible(files):
@@ -373,7 +369,7 @@ def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
 
 
 def choose_target(
-    files: Sequence[FrameFile], target: str | None
+    files: Sequence[FrameFile], target: str | None, judge: Judge
 ) -> tuple[list[FrameFile], list[FrameFile]]:
     """Tell stars apart: the frames of the target and those of reference stars.
 
@@ -383,7 +379,7 @@ def choose_target(
     stars = frames_by_star(usable)
     if target is None and len(stars) > 1:
         # Which star is the target must not depend on files that cannot be used.
-        judge_frames(usable)
+        judge(usable)
         require_some(files)
         usable = admissible(files)
         stars = frames_by_star(usable)
@@ -570,57 +566,6 @@ def exclude_unoriented(science: Sequence[FrameFile]) -> None:
                 f"the header does not state the {fact}, which frames that are fitted together "
                 "need. Add the cards"
             )
-
-
-def judge_frames(files: Iterable[FrameFile]) -> None:
-    """Read files, and exclude those whose pixels cannot be those of a star behind the mask.
-
-    A file is read and judged once. Of frames whose star's position was stated by the user, it is
-    not judged whether the star is there.
-    """
-    for each in admissible(files):
-        if each.observation is not None:
-            continue
-        observation = each.read()
-        if observation is not None:
-            each.reason = (
-                why_odd_noise(observation.noise_ratios)
-                or why_odd_unit(observation)
-                or ("" if each.place is not None else why_no_star(observation))
-            )
-
-
-def exclude_contradicting(
-    files: Iterable[FrameFile],
-    why: Callable[[Sequence[Observation]], Mapping[int, str]],
-) -> None:
-    """Exclude frames, of files that were read, that contradict the others.
-
-    `why` gives reasons by index, such as `pixel_checks.why_turned`. IncompatibleSetupError if half
-    of the target's frames or more have one, and nothing says which are right.
-    """
-    usable = admissible(files)
-    odd = why([_frames(each) for each in usable])
-    if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
-        names = ", ".join(each.name for each in usable)
-        raise IncompatibleSetupError(
-            f"{names} contradict each other: for {usable[min(odd)].name}, {odd[min(odd)]}. Leave "
-            "out those that are wrong, or correct them"
-        )
-    for k, reason in odd.items():
-        usable[k].reason = reason
-
-
-def exclude_copies(files: Iterable[FrameFile]) -> None:
-    """Exclude frames whose pixels are those of another file, whatever the headers say."""
-    usable = admissible(files)
-    for k, j in copies([_frames(each) for each in usable]).items():
-        usable[k].reason = f"its pixels are those of {usable[j].name}: a copy of the exposure"
-
-
-def _frames(file: FrameFile) -> Observation:
-    assert file.observation is not None  # A file that could not be read has a reason.
-    return file.observation
 
 
 def epochs_of(dates: Sequence[Time | None]) -> list[list[int]]:

@@ -7,25 +7,25 @@ pointing of the telescope.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
-import torch
 from astropy import units as u
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter, map_coordinates, shift, uniform_filter
 from scipy.stats import median_abs_deviation
 
-from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.scene.admission import FrameFile, admissible
 from pyklip_diffrender.scene.integrations import dark_pixels
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symmetry, stamp_about
-from pyklip_diffrender.wavefront.opd import random_opd
 
 __all__ = [
     "brightness",
     "copies",
+    "exclude_contradicting",
+    "exclude_copies",
     "why_no_star",
     "why_odd_unit",
     "why_other_brightness",
@@ -119,10 +119,16 @@ _SYMMETRIES: dict[str, Callable[[Image], Image]] = {
 _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 
 
-def why_no_star(observation: Observation) -> str:
+Images = Callable[[Observation, float, float], tuple[Image, Image]]
+"""Images of a star behind the mask and of a source at a distance (arcsec) from it, as far as
+another distance (arcsec) about the source, such as `scene.simulation.images_of_stars`."""
+
+
+def why_no_star(observation: Observation, images: Images) -> str:
     """Why these cannot be frames of a star behind the mask; empty if they can.
 
-    Frames that are too small (1.2 arcsec about the star) are not judged.
+    They are compared with `images` where another source hides the star. Frames that are too small
+    (1.2 arcsec about the star) are not judged.
     """
     stamp = _stamp(observation)
     if stamp is None:
@@ -156,7 +162,7 @@ def why_no_star(observation: Observation) -> str:
         return ""
     if np.hypot(*(center_of_pattern(light, distance) * scale)) <= _PATTERN_BEHIND:
         return ""
-    contrast = _contrast_of_source(observation)
+    contrast = _contrast_of_source(observation, images)
     if contrast < _AS_BRIGHT:
         return ""
     x, y = away
@@ -179,10 +185,10 @@ _INSIST = (
 )
 
 
-def _contrast_of_source(observation: Observation) -> float:
+def _contrast_of_source(observation: Observation, images: Images) -> float:
     """Least contrast of the brightest point source beside the star; infinite if it is not one."""
     try:
-        star, source = _images(observation)
+        star, source = images(observation, _CORE, _SOURCE)
     except DiffrenderError:
         return np.inf
     scale = float(np.mean(observation.pixelscale))
@@ -209,18 +215,6 @@ def _contrast_of_source(observation: Observation) -> float:
     own = float(uniform_filter(image, 3)[tuple(np.round(peak[::-1]).astype(int))])
     flux = own / float(uniform_filter(source, 3).max())
     return flux / most if most > 0 else np.inf
-
-
-def _images(observation: Observation) -> tuple[Image, Image]:
-    """Model images, (n, n), of a star behind the mask and of a source outside it."""
-    scale = float(np.mean(observation.pixelscale))
-    size = 2 * int(np.ceil((_CORE + _SOURCE) / scale)) + 1
-    model = model_for(observation, size, nlambda=1, npix=128)
-    # Without a wavefront error the star would be too faint.
-    wavefront = random_opd(1, npix=128)
-    with torch.no_grad():
-        images = [model(wavefront, (0.0, y)).double().cpu().numpy() for y in (0.0, _CORE)]
-    return images[0], images[1]
 
 
 def _peak(image: Image) -> Image:
@@ -434,3 +428,39 @@ def _noise(observation: Observation, *, clipped: bool = True) -> tuple[Image, ND
     if typical > 0 and clipped:
         difference = np.clip(difference / typical, -6, 6)
     return difference, usable
+
+
+# Exclude frames by their pixels.
+
+
+def exclude_contradicting(
+    files: Iterable[FrameFile],
+    why: Callable[[Sequence[Observation]], Mapping[int, str]],
+) -> None:
+    """Exclude frames, of files that were read, that contradict the others.
+
+    `why` gives reasons by index, such as `why_turned`. IncompatibleSetupError if half
+    of the target's frames or more have one, and nothing says which are right.
+    """
+    usable = admissible(files)
+    odd = why([_frames(each) for each in usable])
+    if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
+        names = ", ".join(each.name for each in usable)
+        raise IncompatibleSetupError(
+            f"{names} contradict each other: for {usable[min(odd)].name}, {odd[min(odd)]}. Leave "
+            "out those that are wrong, or correct them"
+        )
+    for k, reason in odd.items():
+        usable[k].reason = reason
+
+
+def exclude_copies(files: Iterable[FrameFile]) -> None:
+    """Exclude frames whose pixels are those of another file, whatever the headers say."""
+    usable = admissible(files)
+    for k, j in copies([_frames(each) for each in usable]).items():
+        usable[k].reason = f"its pixels are those of {usable[j].name}: a copy of the exposure"
+
+
+def _frames(file: FrameFile) -> Observation:
+    assert file.observation is not None  # A file that could not be read has a reason.
+    return file.observation

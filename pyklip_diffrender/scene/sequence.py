@@ -20,25 +20,32 @@ from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.admission import (
     EPOCH,
     FrameFile,
+    admissible,
     choose_filter,
     choose_target,
     epochs_of,
-    exclude_contradicting,
-    exclude_copies,
     exclude_other_setups,
     exclude_unoriented,
     exclude_unusable,
     exposures_in,
-    judge_frames,
     reasons_of,
     require_some,
     with_references,
 )
 from pyklip_diffrender.scene.exposure import Exposure
+from pyklip_diffrender.scene.integrations import why_odd_noise
 from pyklip_diffrender.scene.observation import Observation, Window
-from pyklip_diffrender.scene.pixel_checks import why_other_brightness, why_turned
+from pyklip_diffrender.scene.pixel_checks import (
+    exclude_contradicting,
+    exclude_copies,
+    why_no_star,
+    why_odd_unit,
+    why_other_brightness,
+    why_turned,
+)
+from pyklip_diffrender.scene.simulation import images_of_stars
 
-__all__ = ["SHORT", "Row", "Sequence", "rows_table"]
+__all__ = ["SHORT", "Row", "Sequence", "judge_frames", "rows_table"]
 
 
 # The table of admission: one row for each file, what it is used for, and what it is.
@@ -113,6 +120,27 @@ def rows_table(rows: abc.Sequence[Row]) -> QTable:
         table[name] = np.asarray(table[name], dtype=float) * unit
     table["position_angle"].info.format = ".2f"
     return table
+
+
+# Frames that cannot be used, by their pixels.
+
+
+def judge_frames(files: Iterable[FrameFile]) -> None:
+    """Read files, and exclude those whose pixels cannot be those of a star behind the mask.
+
+    A file is read and judged once. Of frames whose star's position was stated by the user, it is
+    not judged whether the star is there.
+    """
+    for each in admissible(files):
+        if each.observation is not None:
+            continue
+        observation = each.read()
+        if observation is not None:
+            each.reason = (
+                why_odd_noise(observation.noise_ratios)
+                or why_odd_unit(observation)
+                or ("" if each.place is not None else why_no_star(observation, images_of_stars))
+            )
 
 
 # Sequences: the rolls of a target and the reference stars that go with them.
@@ -317,10 +345,10 @@ class Sequence:
         listed = _usable(files, references, star, target)
         if filter is not None:
             return cls._by_epoch(listed, target, filter)
-        science, _ = choose_target([replace(each) for each in listed], target)
+        science, _ = choose_target([replace(each) for each in listed], target, judge_frames)
         if len({each.exposure.filter for each in science}) > 1:
             judge_frames(listed)
-            science, _ = choose_target([replace(each) for each in listed], target)
+            science, _ = choose_target([replace(each) for each in listed], target, judge_frames)
         names = {each.exposure.filter for each in science} - {None}
         if len(names) < 2:
             return cls._by_epoch(listed, target, next(iter(names), None))
@@ -337,8 +365,8 @@ class Sequence:
         cls, listed: list[FrameFile], target: str | None, filter: str | None
     ) -> tuple[Sequence, ...]:
         """Sort files that were listed, whose reasons this fills in."""
-        choose_filter(listed, filter)
-        science, others = choose_target(listed, target)
+        choose_filter(listed, filter, judge_frames)
+        science, others = choose_target(listed, target, judge_frames)
         star = science[0].star
         together = [*science, *others]
         # Only frames that can be used vote for the set-up.

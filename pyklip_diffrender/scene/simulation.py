@@ -19,11 +19,11 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask, module_of
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import random_opd
 
 __all__ = [
-    "coarse_arguments",
     "expected_photons",
-    "faintness",
+    "images_of_stars",
     "model_for",
     "planet_photons",
     "simulate",
@@ -43,41 +43,6 @@ _CELLS = 1.2
 """Cells of the occulter per lambda/D. The round masks have no structure finer than several
 lambda/D, so that this changes images by 3e-7 of their peak or less, and one cell per pixel is
 enough in all filters of both channels; two cells per pixel take four times as long."""
-
-
-_RING = (5.0, 16.0)
-_REFERENCE = 1800.0
-"""Median of the squared S/N of pixels at these distances from the star, pixels, in one roll of
-G 7-34 in F444W, for which `benchmarks.scene_fidelity` measured what a coarser model costs."""
-
-_VERY_FAINT = 100.0
-
-
-def faintness(observation: Observation) -> float:
-    """By what factor a star is fainter, compared with its noise, than G 7-34 in one roll."""
-    frame = observation.combined()
-    y, x = np.indices(frame.shape)
-    column, row = frame.center[0]
-    away = np.hypot(x - column, y - row)
-    ring = frame.valid[0] & (away > _RING[0]) & (away < _RING[1])
-    if not ring.any():
-        return 1.0
-    # The chi-squared of an error of the model that is a fraction of the light is proportional to
-    # (S/N)^2.
-    squares = (frame.data[0][ring] / frame.error[0][ring]) ** 2
-    return _REFERENCE / max(float(np.median(squares)), 1e-6)
-
-
-def coarse_arguments(observation: Observation, size: int) -> dict[str, Any]:
-    """Arguments of `model_for`, by the noise, for a first look at `size` x `size` pixels."""
-    nlambda = 3 if faintness(observation) >= _VERY_FAINT else 5
-    if observation.filter is None:
-        return {}
-    shortest = float(filter_throughput(observation.filter)[0][0])
-    npix = _NPIX // 2
-    while npix < samples_for_field(size * max(observation.pixelscale), shortest):
-        npix *= 2
-    return {"nlambda": nlambda, "npix": npix}
 
 
 def model_for(observation: Observation, size: int | None = None, **overrides: Any) -> OpticalSystem:
@@ -189,6 +154,22 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         return _cached_model(observation.filter, items, tuple(sorted((defaults or {}).items())))
     except TypeError:  # An argument that cannot be a key, such as a spectrum in arrays.
         return _model(observation.filter, items, tuple((defaults or {}).items()))
+
+
+def images_of_stars(
+    observation: Observation, away: float, reach: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Images, (n, n), of a star behind the mask and of one `away` from it (arcsec, in y).
+
+    They are monochromatic, with an arbitrary wavefront, and show `reach` (arcsec) about both.
+    """
+    size = 2 * int(np.ceil((away + reach) / np.mean(observation.pixelscale))) + 1
+    model = model_for(observation, size, nlambda=1, npix=128)
+    # Without a wavefront error the star would be too faint.
+    wavefront = random_opd(1, npix=128)
+    with torch.no_grad():
+        images = [model(wavefront, (0.0, y)).double().cpu().numpy() for y in (0.0, away)]
+    return images[0], images[1]
 
 
 def _model(name: str, items: Items, defaults: Items) -> OpticalSystem:

@@ -24,7 +24,13 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import measured_planet, with_planets
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, RefinementError
 from pyklip_diffrender.io.files import sha256
-from pyklip_diffrender.reduction import ReduceOptions, Reduction, prepare, summarise, write_products
+from pyklip_diffrender.reduction import (
+    ReduceOptions,
+    ReductionResult,
+    prepare,
+    summarise,
+    write_products,
+)
 from pyklip_diffrender.refinement import FrameFit, Refinement, nircam_settings
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -103,7 +109,7 @@ def _planet(injection: Injection, north: float) -> Planet:
     return Planet(injection.contrast, injection.separation, injection.angle - north)
 
 
-def _recovered(reduction: Reduction, planet: Injection, flux: float) -> dict[str, Any]:
+def _recovered(reduction: ReductionResult, planet: Injection, flux: float) -> dict[str, Any]:
     """Measure an injected planet, as a contrast to a star of that flux."""
     detection = reduction.detection
     # The planet's candidate, or else, without one, the flux at the place of the injection.

@@ -1,0 +1,199 @@
+"""`reduce`, and its result."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, Unpack
+
+from pyklip_diffrender.io.files import require_new
+from pyklip_diffrender.options import ReduceKeywords, ReduceOptions
+from pyklip_diffrender.reduction.pipeline import ReductionResult, prepare
+from pyklip_diffrender.reduction.products import (
+    ProductFolder,
+    existing_products,
+    write_products,
+)
+from pyklip_diffrender.scene.sequence import Sequence
+
+__all__ = ["Reduction", "reduce"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Reduction(ReductionResult):
+    """Result of `reduce`.
+
+    Attributes
+    ----------
+    sequence : Sequence
+        The frames, cut to the fitted pixels.
+    fit : Refinement
+        The fit that was searched: all frames of the target together, with the bright candidates in
+        the model, and without the light of a disk, if that was fitted.
+    detection : Detection
+    references : tuple of Refinement
+        One for each reference star that was fitted.
+    systematics : Systematics or None
+        The flat-field pattern that was used.
+    failed : tuple of (str, str)
+        Reference stars that could not be fitted, and why.
+    pattern : str
+        Origin of the flat-field pattern, with the names of its stars.
+    visit : Visit
+        What every frame of a reference star has contributed to the fit of the target.
+    wide : WideField or None
+        The search of the whole frames, if it was asked for.
+    disk : Disk or None
+        Extended light about the star, if it was asked for.
+    injections : QTable or None
+        Measurements of injected planets, see `recover_planets`, if they were asked for.
+    completeness : QTable or None
+        Fraction of planets that the search finds, see `completeness`, if it was asked for.
+    accuracy : str
+        "full", or "quick" for a first look, see `ReduceOptions`.
+
+    Examples
+    --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
+    >>> print(result.detection.candidates["separation", "contrast", "snr"])  # doctest: +SKIP
+    >>> result.write("products")  # doctest: +SKIP
+    """
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+        derivatives: bool = False,
+        figures: Literal["pdf", "png", "svg"] | None = None,
+    ) -> list[Path]:
+        """Write maps, tables, the fit, the flat-field pattern, figures and a report.
+
+        Parameters
+        ----------
+        folder : path
+            Made if it does not exist.
+        overwrite : bool
+            Replace the products of an earlier reduction, and remove those that this one does not
+            have.
+        derivatives : bool
+            Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
+            space: they are needed to search the fit again (`detect`), and to measure at other
+            places (``Detection.read(...).measure``).
+        figures : {"pdf", "png", "svg"}, optional
+            Write every figure of the report to a file of this format in the folder ``figures``,
+            too. The report itself needs none of them.
+
+        Returns
+        -------
+        list of Path
+            The files that were written.
+
+        Raises
+        ------
+        ExistingFileError
+            If there are products in the folder, and `overwrite` is False; it is also an `OSError`.
+        IncompatibleSetupError
+            For another format of figures.
+        """
+        folder = Path(folder)
+        require_new(existing_products(folder), overwrite)
+        return write_products(self, folder, derivatives=derivatives, figures=figures)
+
+
+def reduce(
+    sequence: Sequence | str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    opd: Any,
+    *,
+    target: str | None = None,
+    filter: str | None = None,
+    progress: bool = False,
+    options: ReduceOptions | None = None,
+    output: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    **keywords: Unpack[ReduceKeywords],
+) -> Reduction:
+    """Search a sequence of real frames for planets.
+
+    The flat-field pattern, the error of the model on the detector's pixels, comes from the
+    package's library or, where that has none, from fits of the sequence's reference stars. With
+    it, all frames of the target are fitted together and searched.
+
+    Parameters
+    ----------
+    sequence : Sequence, or files as for `Sequence.from_files`
+    opd : path, OPDMap, Quantity, array or "flat"
+        The wavefront to start from, as for `refine`. Of a folder of maps, the one nearest in time
+        to the target's frames is taken; see `choose_map` for other rules. "flat" is for frames
+        without a map: the fit then takes longer, and the star's flux is uncertain by 40 % unless
+        `star_flux` says it.
+    target, filter : str, optional
+        See `Sequence.from_files`.
+    progress : bool
+        Show progress bars.
+    options : ReduceOptions, optional
+        Options of the reduction, in place of `keywords`.
+    output : path, optional
+        Folder for the products, as those of `Reduction.write`. They are written as they come: those
+        of the fit and the search before wide, disk, injections and completeness begin.
+    overwrite : bool
+        Replace the products of an earlier reduction in `output`.
+    resume : bool
+        Go on with a reduction that was interrupted after its products in `output` were written
+        for the first time. Frames, map and options must be the same, but for injections and
+        completeness. What the frames of reference stars contributed (``Reduction.visit``) is kept;
+        fits of reference stars by themselves, for a pattern (``Reduction.references``), are not.
+    **keywords
+        Options by name, such as ``size=120``: the fields of `ReduceOptions`.
+
+    Returns
+    -------
+    Reduction
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For options that `ReduceOptions` refuses, and for `star_flux` with frames that are not
+        calibrated.
+    TypeError
+        For a keyword that is no option, or keywords together with `options`.
+    ExistingFileError
+        If there are products in `output`, and neither `overwrite` nor `resume` allows it; it is
+        also an `OSError`.
+    DiffrenderError
+        If the target cannot be fitted. A reference star that cannot be is left out.
+
+    Examples
+    --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
+    >>> print(result)  # doctest: +SKIP
+    """
+    if options is None:
+        options = ReduceOptions.from_keywords(keywords)
+    elif keywords:
+        raise TypeError(
+            f"reduce() got options and the keywords {', '.join(keywords)}, expected one of the two"
+        )
+    if not isinstance(sequence, Sequence):
+        sequence = Sequence.from_files(sequence, target=target, filter=filter)
+    if output is None:
+        if overwrite or resume:
+            raise TypeError("reduce() got overwrite or resume without output, a folder")
+        return _writable(prepare(sequence, opd, options).run(progress=progress))
+    products = ProductFolder(output, overwrite=overwrite, resume=resume)
+    result = prepare(sequence, opd, options).run(progress=progress, products=products)
+    products.finish(result)
+    return _writable(result)
+
+
+def _writable(result: ReductionResult) -> Reduction:
+    return Reduction(**{each.name: getattr(result, each.name) for each in fields(result)})
