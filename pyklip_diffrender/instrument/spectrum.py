@@ -74,11 +74,11 @@ def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 def blackbody(temperature: float, wavelengths: ArrayLike) -> NDArray[np.float64]:
     """Photons per unit wavelength of a blackbody of `temperature` (K), at wavelengths in m."""
-    # B_lambda / (h c / lambda) is proportional to lambda^-4 / (exp(h c / lambda k T) - 1).
-    exponent = (constants.h * constants.c / constants.k_B).to_value(u.m * u.K) / (
-        native_float64(wavelengths) * temperature
-    )
-    return native_float64(1e-24 / native_float64(wavelengths) ** 4 / np.expm1(exponent))
+    wavelength = native_float64(wavelengths) * u.m
+    radiance = BlackBody(temperature * u.K, scale=1 * u.W / (u.m**3 * u.sr))(wavelength)
+    # The energy of a photon is h c / lambda.
+    photons = radiance * wavelength / (constants.h * constants.c)
+    return native_float64(photons.to_value(1 / (u.s * u.m**3 * u.sr)))
 
 
 def filter_bandpass(

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from astropy import units as u
+from astropy.coordinates import angular_separation
 from astropy.io import fits
 from astropy.time import Time
 
@@ -160,10 +161,8 @@ class CatalogueStar:
         """Arcsec between the coordinates of two headers; None if one has none."""
         if self.coordinates is None or other.coordinates is None:
             return None
-        (a, d), (b, e) = np.deg2rad([self.coordinates, other.coordinates])
-        # The haversine formula, which keeps its digits at small angles.
-        half = np.sin((e - d) / 2) ** 2 + np.cos(d) * np.cos(e) * np.sin((b - a) / 2) ** 2
-        return float(np.rad2deg(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1)))) * 3600)
+        places = np.deg2rad([*self.coordinates, *other.coordinates])
+        return float(np.rad2deg(angular_separation(*places)) * 3600)
 
     def is_same(self, other: CatalogueStar) -> bool:
         """Whether two headers describe one star: coordinates decide, names where there are none."""
