@@ -5,10 +5,12 @@ Run from the root of the project::
     python -m benchmarks.neighbours FRAMES MAP -o neighbours.ecsv [--jobs N]
 
 FRAMES is the folder with the calints files of programme 1184. A source is added to both rolls of
-G 7-34 in F444W, as the fit of the untouched files renders it, and the changed files are reduced
-with the defaults. A row says whether both files were used as before, whether the source is among
-the companions of the fit and the candidates, its measured contrast and position, what else was
-found, and the ratio of the limits further than 1.5 lambda/D from it to those without it.
+G 7-34 in F444W, as the fit of the untouched files renders it: times the flat-field pattern of the
+pixels, which differs from that of the library by its stated error, with photon noise and the errors
+that it adds. The changed files are reduced with the defaults. A row says whether both files were
+used as before, whether the source is among the companions of the fit and the candidates, its
+measured contrast and position, what else was found, and the ratio of the limits further than 1.5
+lambda/D from it to those without it.
 """
 
 from __future__ import annotations
@@ -36,6 +38,11 @@ from pyklip_diffrender.scene.jwst_files import shift_frames
 
 NAMES = "jw0118400[56]001_03106_*calints.fits*"
 ANGLE = 110.0
+SIDE = 160
+"""Pixels with light of the source; 80 are fitted."""
+GAIN = 1.82
+"""Electrons per count of NIRCam's long-wave detectors (JWST User Documentation, "NIRCam Detector
+Performance")."""
 CASES = (
     (1e-4, 0.6), (1e-4, 1.2), (1e-3, 0.4), (1e-3, 1.2), (1e-3, 2.0), (1e-2, 0.6), (1e-2, 1.2),
     (1e-2, 2.0), (0.1, 0.4), (0.1, 0.8), (0.1, 1.5), (0.1, 2.2),
@@ -43,16 +50,24 @@ CASES = (
 """Contrasts, and separations in arcsec."""
 
 
-def light_of(reduction: dr.Reduction, contrast: float, separation: float) -> list[NDArray[Any]]:
-    """The source in the fitted square of each roll, (ny, nx)."""
-    frames = reduction.fit.frames
+def light_of(
+    reduction: dr.Reduction, cut: dr.Sequence, contrast: float, separation: float
+) -> list[NDArray[Any]]:
+    """The source in each frame of `cut`, (ny, nx), on the pixels of the detector."""
+    frames, known = reduction.fit.frames, reduction.systematics
+    assert known is not None
     planet = dr.Planet(contrast, separation, ANGLE)
     lights = []
-    for frame in frames:
+    for frame, part in zip(frames, cut.science, strict=True):
         roll = frame.observation.roll_from(frames[0].observation)
         x, y = frame.values["star_offset"] + planet.rotated(roll).offset
-        light = frame.render(background=False, source=(float(x), float(y)))
-        lights.append(contrast * np.asarray(light).reshape(light.shape[-2:]))
+        light = frame.render(
+            part.shape, tuple(part.center[0]), background=False, source=(float(x), float(y))
+        )
+        # Both rolls show the same pixels of the detector.
+        pattern, error = known.at(part)
+        pixels = 1 + pattern + error * np.random.default_rng(5).normal(size=pattern.shape)
+        lights.append(contrast * pixels * light.reshape(part.shape))
     return lights
 
 
@@ -74,14 +89,20 @@ def with_source(
     """
     size = lights[0].shape[-1]
     windows, _ = sequence.windows((size, size))
+    rng = np.random.default_rng(6)
     for path, frame, window, light in zip(paths, sequence.science, windows, lights, strict=True):
         with fits.open(path) as hdus:
             science = hdus["SCI"]
             stated = np.array([science.header[key] - 1 for key in ("CRPIX1", "CRPIX2")])
-            whole = np.zeros((1, *science.shape[1:]))
+            per_unit = science.header["PHOTMJSR"] / (GAIN * hdus[0].header["EFFINTTM"])
+            variance = per_unit * np.clip(light, 0, None)
             box = np.s_[:, window.y : window.y + size, window.x : window.x + size]
-            whole[box] = light
-            science.data += shift_frames(whole, (stated - frame.center[0])[None])
+            whole = np.zeros((2, *science.shape[1:]))
+            whole[0][box[1:]] = light + np.sqrt(variance) * rng.normal(size=light.shape)
+            whole[1][box[1:]] = variance
+            moved = shift_frames(whole, np.tile(stated - frame.center[0], (2, 1)))
+            science.data += moved[:1]
+            hdus["ERR"].data = np.sqrt(hdus["ERR"].data ** 2 + np.clip(moved[1:], 0, None))
             hdus.writeto(folder / path.name.removesuffix(".gz"))
 
 
@@ -105,7 +126,7 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
         elif [each.first_pixel for each in changed.science] != base["first"]:
             row["outcome"] = "another first_pixel"
         try:
-            reduction = dr.reduce(changed, opd)
+            reduction = dr.reduce(changed, opd, wide=base["wide"])
         except DiffrenderError as error:
             return row | {"outcome": f"no fit: {error}"}
     detection = reduction.detection
@@ -121,7 +142,8 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
     flux = reduction.fit.frames[0].flux
     ratio = (flux * error / base["error"])[far]
     found = false = 0
-    for candidate in detection.candidates:
+    wide = reduction.wide
+    for candidate in detection.candidates if wide is None else wide.candidates:
         position = candidate["position_angle"].to_value("deg") - north
         r = candidate["separation"].to_value("arcsec")
         there = r * np.array([-np.sin(np.deg2rad(position)), np.cos(np.deg2rad(position))])
@@ -152,6 +174,7 @@ def main() -> None:
     parser.add_argument("map", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--wide", action="store_true", help="search the whole frames as well")
     parser.add_argument("--cases", nargs="+", metavar="CONTRAST,ARCSEC", help="instead of all")
     options = parser.parse_args()
     cases: list[tuple[float, float]] = list(CASES)
@@ -163,11 +186,13 @@ def main() -> None:
     sequence = dr.Sequence.from_files(sorted(options.frames.glob(NAMES)))
     untouched = dr.reduce(sequence, options.map)
     detection, frames = untouched.detection, untouched.fit.frames
+    around = sequence.cutout(SIDE)
     base = {
         "first": [each.first_pixel for each in sequence.science],
         "flux": frames[0].flux,
         "error": frames[0].flux * detection.error * detection.error_factor.of(detection.grid),
-        "light": {each: light_of(untouched, 1.0, each) for each in {r for _, r in cases}},
+        "light": {each: light_of(untouched, around, 1.0, each) for each in {r for _, r in cases}},
+        "wide": options.wide,
     }
     work = partial(one, options.frames, options.map, base)
     rows = []
