@@ -18,7 +18,7 @@ from synthetic_searches import CURVATURE, PIXEL, noise, searched
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Motion
-from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.error_factor import ErrorFactor, structures_in_single_roll
 from pyklip_diffrender.detection.sky_map import Family, SkyStack
 from pyklip_diffrender.detection.templates import weigh
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -194,6 +194,21 @@ def test_errors_that_are_hardly_known_need_a_higher_peak():
     assert len(known.candidates) == 1
     assert len(unsure.candidates) == 0
     np.testing.assert_allclose(known.snr, unsure.snr)
+
+
+def test_structures_of_the_detector_pass_for_sources_where_all_frames_have_one_roll():
+    def candidate(north):
+        maps = [
+            searched(name, k, [(0.6, 0.35, 5.5)], north=angle, header={"INSTRUME": "NIRCAM"})
+            for k, (name, angle) in enumerate((("F444W", 0.0), ("F356W", north)), 1)
+        ]
+        return dr.combine(maps).candidates[0]
+
+    alike, turned = candidate(0.5), candidate(10.0)
+    structures = float(structures_in_single_roll(alike["snr"]))
+    assert structures > 1e-3
+    assert alike["false_alarm_probability"] == pytest.approx(structures, rel=0.1)
+    assert turned["false_alarm_probability"] < 0.01 * structures
 
 
 def test_a_bad_fit_is_left_out_and_its_candidates_with_it():

@@ -35,6 +35,7 @@ from pyklip_diffrender.detection.combined_result import (
     star_of_filter,
     unmoved,
 )
+from pyklip_diffrender.detection.error_factor import structures_in_single_roll
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.sky_map import (
@@ -56,7 +57,13 @@ from pyklip_diffrender.detection.sky_map import (
 )
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.spectrum import PlanetSpectra, planet_spectra, star_flux_density
-from pyklip_diffrender.io.units import require_positive, to_arcsec, to_number, to_unit
+from pyklip_diffrender.io.units import (
+    half_circle,
+    require_positive,
+    to_arcsec,
+    to_number,
+    to_unit,
+)
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.exposure import proper_motion as motion_of
 from pyklip_diffrender.scene.exposure import star_of
@@ -240,6 +247,12 @@ class _Peak:
         return {each.name: self.place + moves[each.name] for each in self.search.maps}
 
 
+def _in_one_roll(maps: tuple[SkyMap, ...]) -> bool:
+    """Whether all maps have one orientation, so that structures of the detector do not turn."""
+    turned = [abs(half_circle(each.north - maps[0].north)) for each in maps]
+    return all(each.single_roll for each in maps) and max(turned) < 1
+
+
 class _Searcher:
     """The parts of `combine` that share the maps."""
 
@@ -394,6 +407,10 @@ class _Searcher:
                     if sigmas >= level and np.hypot(*place) >= self.inner:
                         expected = trials * sum(each.expected(sigmas) for each in families)
                         alarm = -math.expm1(-expected)
+                        if _in_one_roll(search.maps):
+                            # Filters of one channel share the pixels of the detector.
+                            structure = float(structures_in_single_roll(sigmas))
+                            alarm = 1 - (1 - alarm) * (1 - structure)
                         peaks.append(_Peak(search, move, name, place, sigmas, alarm))
         return peaks
 

@@ -75,6 +75,8 @@ class SkyMap:
     resolution: float  # lambda/D, arcsec.
     star: float | None = None  # Flux density of the star, Jy.
     threshold: float = 5.0  # S/N of a candidate of the single search.
+    # Whether it is of real frames of one roll, where structures of the detector pass for sources.
+    single_roll: bool = False
     # (k, 4), east and north of the reduction's own candidates; what is to be added to the contrast
     # of the map there, and by what its error is to be multiplied, so that they are those of all
     # candidates fitted together.
@@ -112,6 +114,7 @@ class SkyMap:
             resolution=resolution,
             star=detection.sky.star_jansky,
             threshold=detection.threshold,
+            single_roll=detection.rolls == 1 and detection.observation.is_nircam,
         )
         places = plain.on_sky(offsets)
         snr_there, _, error_there = plain.at(places)
