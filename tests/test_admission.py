@@ -15,9 +15,8 @@ from scipy.ndimage import gaussian_filter
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints, starlight
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.scene.exposure import CatalogueStar, beginning, image_mask
-
 
 FIRST, SECOND, THIRD = (f"jw0118400{k}001_03106_00001_nrcalong_calints.fits" for k in (1, 2, 3))
 
@@ -67,6 +66,13 @@ def test_the_table_says_what_every_file_is(folder):
     assert first["ra"].to_value("deg") == 100.0
     assert first["position_angle"].to_value("deg") == pytest.approx(70.05)
     assert len(table.colnames) >= 18
+    assert sequence.target == "HD 1"
+    assert [each.reference for each in sequence.references] == [True]
+    assert sequence.science[1].roll_from(sequence.science[0]) == pytest.approx(-10)
+    assert sequence.cutout(10).science[0].shape == (10, 10)
+    chosen = dr.Sequence.from_files(folder, target="hd 2")
+    assert [each.name for each in chosen.science] == [THIRD]
+    assert len(chosen.references) == 2
 
 
 STARS = ("TARGPROP", "TARGNAME", "TARG_RA", "TARG_DEC")
@@ -88,7 +94,7 @@ EXCLUDED = [
     ("b.fits", {"DETECTOR": "NRCBLONG"}, "DETECTOR is NRCBLONG"),
     ("mas.fits", {"XOFFSET": 15.0, "YOFFSET": -10.0}, "milliarcseconds"),
     ("pup.fits", {"PUPIL": "CLEAR"}, "PUPIL is CLEAR"),
-    ("two.fits", {"CORONMSK": "MASKA430R"}, "name different masks"),
+    ("two.fits", {"CORONMSK": "MASKA430R"}, "CORONMSK MASKA430R.*name different masks"),
     ("area.fits", {"PIXAR_A2": 0.00096}, "^by PIXAR_A2 .*0.063 in NRCALONG"),
     ("old.fits", {"DATE-BEG": "2012-01-01"}, "^the exposure.*the launch"),
     ("mid.fits", {"EXPMID": 59000.5}, "EXPMID is 59000.5, expected about"),
@@ -110,25 +116,19 @@ def test_what_is_no_frame_of_this_setup_is_excluded(folder):
     assert all(uses(sequence)[name] == "excluded" for name in said)
 
 
-@pytest.mark.parametrize("extension", ["PRIMARY", "RESULT_PHASE"])
-def test_a_wavefront_map_is_no_frame(tmp_path, extension):
+@pytest.mark.parametrize("name", ["PRIMARY", "RESULT_PHASE"])
+def test_a_wavefront_map_is_no_frame(tmp_path, name):
     """In the wrong place on the command line, and in the folder of the frames."""
-    maps, frames = tmp_path / "maps", tmp_path / "frames"
-    maps.mkdir()
-    data = np.zeros((16, 16))
-    if extension == "PRIMARY":
-        header = fits.Header({"BUNIT": "um"})
-        hdus = fits.HDUList([fits.PrimaryHDU(data, header)])
+    image = fits.ImageHDU(np.zeros((16, 16)), fits.Header({"BUNIT": "um"}), name=name)
+    if name == "PRIMARY":
+        image.writeto(tmp_path / "opd.fits")
     else:
-        hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(data, name=extension)])
-    hdus.writeto(maps / "opd_2022-10-02.fits")
+        fits.HDUList([fits.PrimaryHDU(), image]).writeto(tmp_path / "opd.fits")
     words = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd"
     with pytest.raises(NoValidPixelsError, match=words):
-        dr.Sequence.from_files(maps)
-    frames.mkdir()
-    calints(frames / "a.fits")
-    hdus.writeto(frames / "map.fits")
-    assert reasons(dr.Sequence.from_files(frames))["map.fits"].startswith("it is a wavefront map")
+        dr.Sequence.from_files(tmp_path)
+    calints(tmp_path / "a.fits")
+    assert reasons(dr.Sequence.from_files(tmp_path))["opd.fits"].startswith("it is a wavefront map")
 
 
 def test_one_exposure_is_used_once(folder):
@@ -164,10 +164,11 @@ OTHER = {"CORONMSK": "MASKA430R", "SUBARRAY": "SUB320A430R", "APERNAME": "NRCA5_
 
 def test_the_setup_of_most_of_the_targets_frames_is_reduced(folder):
     for k in (4, 5, 6):
-        date = f"2022-10-03T0{k}:30:00"
+        date = f"2022-10-03T0{9 - k}:30:00"
         another(folder, f"r{k}.fits", observation=k, roll=60.0 + k, cards=OTHER, date=date)
     sequence = dr.Sequence.from_files(folder)
-    assert [each.name for each in sequence.science] == ["r4.fits", "r5.fits", "r6.fits"]
+    # In the order of time.
+    assert [each.name for each in sequence.science] == ["r6.fits", "r5.fits", "r4.fits"]
     assert all("mask is MASK335R, not MASK430R" in reason for _, reason in sequence.excluded)
     assert len(sequence.excluded) == 3
 
@@ -264,11 +265,6 @@ def test_the_mask_is_known_by_any_of_three_cards(cards, mask):
     assert image_mask(fits.Header(cards), "a.fits") == mask
 
 
-def test_masks_that_contradict_each_other_are_refused():
-    with pytest.raises(CorruptFileError, match="CORONMSK MASKA335R, SUBARRAY SUB320A430R"):
-        image_mask(fits.Header({"CORONMSK": "MASKA335R", "SUBARRAY": "SUB320A430R"}), "a.fits")
-
-
 def test_epochs_are_separate_sequences(folder):
     another(folder, "later.fits", date="2023-12-01T13:00:00")
     with pytest.raises(IncompatibleSetupError, match=r"2022-10-03 \(jw.*2023-12-01 \(later"):
@@ -311,27 +307,23 @@ def test_frames_that_cannot_share_a_fit_are_refused():
     assert angled.pointings() == (angled,)
 
 
-def scaled(factor):
+def times(**factors):
     def change(arrays):
-        arrays["SCI"] *= factor
-        arrays["ERR"] *= factor
+        for name, factor in factors.items():
+            arrays[name] *= factor
 
     return change
 
 
-def noisy(arrays):
-    arrays["ERR"] /= 20
+def flipped(**shifts):
+    """About the star, which is not in the middle."""
+    axes = [{"x": -1, "y": -2}[name] for name in shifts]
 
+    def change(arrays):
+        for name, array in arrays.items():
+            arrays[name] = np.roll(np.flip(array, axes), tuple(shifts.values()), axes)
 
-def mirrored(arrays):
-    # About the star.
-    for name, array in arrays.items():
-        arrays[name] = np.roll(array[..., ::-1], -3, axis=-1)
-
-
-def turned(arrays):
-    for name, array in arrays.items():
-        arrays[name] = np.roll(array[..., ::-1, ::-1], (3, -3), axis=(-2, -1))
+    return change
 
 
 def subtracted(arrays):
@@ -343,13 +335,13 @@ def subtracted(arrays):
     ("light", "change", "words"),
     [
         (starlight((24.0, 3.0)), None, "centred 1.5 arcsec .*not behind the mask"),
-        (None, scaled(2.5), "2.5 times as bright .*BUNIT"),
-        (None, scaled(1e-3), "scatter by .* MJy/sr, expected .*BUNIT"),
-        (None, noisy, "scatter 20 times as much as ERR says"),
+        (None, times(SCI=2.5, ERR=2.5), "2.5 times as bright .*BUNIT"),
+        (None, times(SCI=1e-3, ERR=1e-3), "scatter by .* MJy/sr, expected .*BUNIT"),
+        (None, times(ERR=0.05), "scatter 20 times as much as ERR says"),
         (None, subtracted, "the star was subtracted"),
         (0.0 * starlight(), None, "no light of a star"),
-        (None, mirrored, "pixels are mirrored left to right"),
-        (None, turned, "pixels are turned by 180 degrees"),
+        (None, flipped(x=-3), "pixels are mirrored left to right"),
+        (None, flipped(y=3, x=-3), "pixels are turned by 180 degrees"),
     ],
     ids=["off the mask", "unit", "factor", "errors", "subtracted", "empty", "mirror", "turned"],
 )
@@ -362,7 +354,7 @@ def test_frames_whose_pixels_contradict_the_others_are_excluded(folder, light, c
 
 def test_of_two_frames_that_differ_in_brightness_none_is_right(folder):
     (folder / SECOND).unlink()
-    another(folder, SECOND, change=scaled(2.5))
+    another(folder, SECOND, change=times(SCI=2.5, ERR=2.5))
     with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND} contradict each other"):
         dr.Sequence.from_files(folder)
 
@@ -398,10 +390,12 @@ def test_nothing_usable_is_an_error_with_every_reason_once(folder):
     assert str(raised.value).count("NRC_TACQ") == 1
     for k in range(2):
         shutil.copy(paths[0], folder / f"z{k}.fits")
-    with pytest.raises(NoValidPixelsError, match=rf"5 files can .*{names} and 2 more: .*NRC_TACQ"):
-        dr.Sequence.from_files(folder)
-    with pytest.raises(NoValidPixelsError, match=r"the file cannot be used: z0.fits: .*NRC_TACQ"):
-        dr.Sequence.from_files([folder / "z0.fits"])
+    for files, words in (
+        (folder, rf"5 files can .*{names} and 2 more: .*NRC_TACQ"),
+        ([folder / "z0.fits"], r"the file cannot be used: z0.fits: .*NRC_TACQ"),
+    ):
+        with pytest.raises(NoValidPixelsError, match=words):
+            dr.Sequence.from_files(files)
 
 
 def test_real_frames_are_admitted(shared_data):
@@ -422,21 +416,17 @@ def twin(tmp_path_factory):
     return cube(tmp_path_factory.mktemp("twin") / "twin.fits", None)
 
 
-def zero(arrays):
-    arrays["SCI"][2] = 0.0
-
-
-def flagged(arrays):
-    arrays["DQ"][2] = 1
-
-
 def dim(arrays):
     arrays["SCI"][2] -= 0.4 * starlight()
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [(zero, "have the value 0"), (flagged, "flagged"), (dim, "0.60 times as bright")],
+    [
+        (lambda arrays: arrays["SCI"][2].fill(0.0), "have the value 0"),
+        (lambda arrays: arrays["DQ"][2].fill(1), "flagged"),
+        (dim, "0.60 times as bright"),
+    ],
 )
 def test_an_integration_that_deviates_is_left_out_and_named(tmp_path, twin, change, words):
     got = cube(tmp_path / "x.fits", change)
@@ -619,12 +609,9 @@ def truncated(path):
     path.write_bytes(path.read_bytes()[:20000])
 
 
-def product(path):
-    fits.setval(path, "DRVERS", value="0.1")
-
-
-def klip(path):
-    fits.setval(path, "PSFSUB", value="pyKLIP")
+def stating(**card):
+    """The header says that it is a product."""
+    return lambda path: [fits.setval(path, key, value=value) for key, value in card.items()]
 
 
 def empty(path):
@@ -636,8 +623,14 @@ def empty(path):
 @pytest.mark.parametrize(
     ("spoil", "cards"),
     [
-        *((each, OTHER) for each in (without("SCI"), without("ERR"), truncated, product, klip)),
-        *((empty, each) for each in (OTHER, {"FILTER": "F356W"}, {"TARGPROP": "HD 9"})),
+        (without("SCI"), OTHER),
+        (without("ERR"), OTHER),
+        (truncated, OTHER),
+        (stating(DRVERS="0.1"), OTHER),
+        (stating(PSFSUB="pyKLIP"), OTHER),
+        (empty, OTHER),
+        (empty, {"FILTER": "F356W"}),
+        (empty, {"TARGPROP": "HD 9"}),
     ],
 )
 def test_files_that_cannot_be_used_do_not_vote(folder, spoil, cards):

@@ -34,10 +34,6 @@ def nddata(values, mask, unit):
     return NDData(values, mask=mask, unit=unit)
 
 
-def nddata_of_masked(values, mask, unit):
-    return NDData(values if mask is None else Masked(values, mask=mask), unit=unit)
-
-
 def ccddata(values, mask, unit):
     flags = None if mask is None else np.where(mask, 4, 0)  # Bits of a data-quality array.
     return CCDData(values, mask=flags, unit=unit)
@@ -47,22 +43,12 @@ def column(values, mask, unit):
     return Column(values, unit=unit) if mask is None else MaskedColumn(values, mask=mask, unit=unit)
 
 
-def of_qtable(values, mask, unit):
-    return QTable({"flux": quantity(values, mask, unit)})["flux"]
-
-
 def of_table(values, mask, unit):
-    table = Table({"flux": np.ma.MaskedArray(values, mask=mask) if mask is not None else values})
-    table["flux"].unit = unit
-    return table["flux"]
+    return QTable({"flux": quantity(values, mask, unit)})["flux"]
 
 
 def part(mask, k):
     return None if mask is None else mask[k]
-
-
-def rows(values, mask, unit):
-    return [quantity(values[k], part(mask, k), unit) for k in range(3)]
 
 
 def rows_of_ccddata(values, mask, unit):
@@ -74,8 +60,7 @@ def rows_of_rows(values, mask, unit):
 
 
 CONTAINERS = [
-    quantity, numpy_masked, nddata, nddata_of_masked, ccddata, column, of_qtable, of_table, rows,
-    rows_of_ccddata, rows_of_rows,
+    quantity, numpy_masked, nddata, ccddata, column, of_table, rows_of_ccddata, rows_of_rows,
 ]  # fmt: skip
 
 
@@ -96,6 +81,7 @@ def test_masked_values_are_nan_and_units_are_converted(container, mask, unit):
     assert got.dtype == np.float64
     assert got.flags.c_contiguous
     np.testing.assert_allclose(got, factor * expected, rtol=1e-14)
+    got[:] = 7
     np.testing.assert_array_equal(before, VALUES)
     np.testing.assert_allclose(native_float64(value), expected, rtol=1e-14)
     if unit is not None:
@@ -115,9 +101,6 @@ def test_an_observation_masks_what_its_container_masks(container):
 
 def test_a_column_in_centimetres_is_a_length():
     assert to_metres(Table({"x": Column([150.0], unit="cm")})["x"], "x") == pytest.approx([1.5])
-    assert dr.Observation.from_arrays(
-        VALUES, VALUES, pixelscale=Column([63.0, 64.0], unit="mas")
-    ).pixelscale == pytest.approx((0.063, 0.064))
 
 
 def test_masks_of_masks():

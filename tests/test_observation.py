@@ -90,17 +90,19 @@ def test_scaled_integers_equal_their_values(tmp_path, frames):
     np.testing.assert_array_equal(Observation.from_fits(path).data, counts * 0.25 + 3.0)
 
 
-@pytest.mark.parametrize("name", ["SCI", "ERR"])
-def test_a_missing_extension_is_named(tmp_path, frames, name):
-    path = calints(tmp_path / "part.fits", frames, leave_out=(name,))
-    with pytest.raises(CorruptFileError, match=rf"part\.fits: no {name} extension"):
-        Observation.from_fits(path)
-
-
-@pytest.mark.parametrize("unit", [None, "", "parsnips"])
-def test_a_missing_or_unknown_unit_is_an_error(tmp_path, frames, unit):
-    path = calints(tmp_path / "unit.fits", frames, BUNIT=unit)
-    with pytest.raises(UnitError, match=r"unit\.fits.*(BUNIT|parsnips).*MJy/sr"):
+@pytest.mark.parametrize(
+    ("facts", "error", "words"),
+    [
+        ({"leave_out": ("SCI",)}, CorruptFileError, "no SCI extension"),
+        ({"leave_out": ("ERR",)}, CorruptFileError, "no ERR extension"),
+        ({"BUNIT": None}, UnitError, "BUNIT.*MJy/sr"),
+        ({"BUNIT": ""}, UnitError, "BUNIT.*MJy/sr"),
+        ({"BUNIT": "parsnips"}, UnitError, "parsnips.*MJy/sr"),
+    ],
+)
+def test_what_a_file_lacks_is_named(tmp_path, frames, facts, error, words):
+    path = calints(tmp_path / "part.fits", frames, **facts)
+    with pytest.raises(error, match=rf"part\.fits.*{words}"):
         Observation.from_fits(path)
 
 
