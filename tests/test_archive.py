@@ -29,7 +29,7 @@ class Observations:
             ("3", "AU-MIC", "F444W;MASKRND"),
         ]
         self.rights = dict.fromkeys(NAMES, "PUBLIC")
-        self.short, self.renamed, self.offline = "", "", None
+        self.short, self.renamed, self.failures = "", "", {}
         self.asked, self.fetched, self.tokens = {}, [], []
 
     def query_criteria(self, **criteria):
@@ -68,10 +68,11 @@ class Observations:
         return "COMPLETE", None, None
 
     def _online(self, what):
-        if self.offline == what:
-            raise NoConnection("Failed to resolve 'mast.stsci.edu'")
-        if self.offline == f"interrupted {what}":
-            raise KeyboardInterrupt
+        if what in self.failures:
+            raise self.failures[what]
+
+
+OFFLINE = NoConnection("Failed to resolve 'mast.stsci.edu'")
 
 
 @pytest.fixture
@@ -138,19 +139,22 @@ def test_a_name_that_leaves_the_folder_is_refused(mast, tmp_path, name):
     assert mast.fetched == []
 
 
-@pytest.mark.parametrize("failure", ["short", "offline", "interrupted"])
-def test_a_part_of_a_file_is_not_taken_for_a_file(mast, tmp_path, failure):
-    if failure == "short":
-        mast.short = NAMES[1]
-    else:
-        mast.offline = FILES[1] if failure == "offline" else f"interrupted {FILES[1]}"
-    interrupted = failure == "interrupted"
-    words = None if interrupted else "1 of 2 files are complete"
-    with pytest.raises(KeyboardInterrupt if interrupted else ArchiveError, match=words):
+@pytest.mark.parametrize(
+    ("state", "error", "words"),
+    [
+        ({"short": NAMES[1]}, ArchiveError, "1 of 2 files are complete"),
+        ({"failures": {FILES[1]: OFFLINE}}, ArchiveError, "1 of 2 files are complete"),
+        ({"failures": {FILES[1]: KeyboardInterrupt()}}, KeyboardInterrupt, None),
+    ],
+    ids=["short", "offline", "interrupted"],
+)
+def test_a_part_of_a_file_is_not_taken_for_a_file(mast, tmp_path, state, error, words):
+    vars(mast).update(state)
+    with pytest.raises(error, match=words):
         archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
     assert left(tmp_path) == FILES[:1]
     # The next call fetches only what is missing.
-    mast.short, mast.offline, mast.fetched = "", None, []
+    mast.short, mast.failures, mast.fetched = "", {}, []
     archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
     assert mast.fetched == FILES[1:]
     assert left(tmp_path) == FILES
@@ -169,13 +173,6 @@ def test_proprietary_files_need_a_token(mast, tmp_path, monkeypatch):
     assert mast.tokens == ["secret"]
 
 
-def test_without_a_network_the_message_says_so(mast, tmp_path):
-    mast.offline = "query"
-    with pytest.raises(ArchiveError, match=r"MAST cannot be reached .*download the files"):
-        archive.fetch_calints(1184, folder=tmp_path / "new")
-    assert left(tmp_path) == []
-
-
 def test_without_astroquery_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "astroquery", None)
     with pytest.raises(ArchiveError, match=r"python -m pip install astroquery$"):
@@ -183,22 +180,26 @@ def test_without_astroquery_the_message_says_what_to_install(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("program", "options", "message"),
+    ("state", "options", "error", "message"),
     [
-        ("GTO", {}, "expected the number of a JWST programme"),
-        (1184, {"target": "Vega"}, "target: got 'Vega', expected one of 'AU-MIC', 'G-7-34'"),
-        (1184, {"filter": "F200W"}, "filter: got 'F200W'"),
+        ({}, {"program": "GTO"}, IncompatibleSetupError, "the number of a JWST programme"),
+        (
+            {},
+            {"target": "Vega"},
+            IncompatibleSetupError,
+            "target: got 'Vega', expected one of 'AU",
+        ),
+        ({}, {"filter": "F200W"}, IncompatibleSetupError, "filter: got 'F200W'"),
+        ({"rows": []}, {}, ArchiveError, "no coronagraphic frames of NIRCam of programme 1184"),
+        ({"failures": {"query": OFFLINE}}, {}, ArchiveError, "cannot be reached .*download the fi"),
     ],
+    ids=["programme", "target", "filter", "no coronagraphy", "offline"],
 )
-def test_what_the_programme_does_not_have(mast, program, options, message):
-    with pytest.raises(IncompatibleSetupError, match=message):
-        archive.fetch_calints(program, **options)
-
-
-def test_a_programme_without_coronagraphy_is_an_error(mast):
-    mast.rows = []
-    with pytest.raises(ArchiveError, match="no coronagraphic frames of NIRCam of programme 1"):
-        archive.list_calints(1)
+def test_what_cannot_be_fetched_is_said(mast, tmp_path, state, options, error, message):
+    vars(mast).update(state)
+    with pytest.raises(error, match=message):
+        archive.fetch_calints(**{"program": 1184, "folder": tmp_path / "new"} | options)
+    assert left(tmp_path) == []
 
 
 REDUCE = ["reduce", "--program", "1184", "--filter", "F444W", "--opd", "opd.fits"]

@@ -12,8 +12,16 @@ import pytest
 import torch
 from astropy.io import fits
 
-from pyklip_diffrender.errors import CorruptFileError
-from pyklip_diffrender.io import native_float64, open_fits, replacing, sha256, to_metres, write_fits
+from pyklip_diffrender.errors import CorruptFileError, NonFiniteError
+from pyklip_diffrender.io import (
+    native_float64,
+    open_fits,
+    replacing,
+    require_finite,
+    sha256,
+    to_metres,
+    write_fits,
+)
 
 
 def written(path):
@@ -51,6 +59,15 @@ def test_every_kind_of_array_becomes_the_same_native_copy(dress, tmp_path):
     to_metres(value, "x")[:] = 7
     # What was given stays as it is.
     np.testing.assert_array_equal(native_float64(value), plain)
+
+
+def test_values_that_are_not_finite_are_counted_and_located():
+    array = np.zeros((5, 6))
+    array[2, 3], array[4, 1], array[0, 5] = np.nan, np.inf, -np.inf
+    with pytest.raises(NonFiniteError, match=r"map: 3 values.*\(0, 5\)"):
+        require_finite(array, "map")
+    with pytest.raises(NonFiniteError, match=r"map: 2 values.*\(2, 3\)"):
+        require_finite(array, "map", np.arange(30).reshape(5, 6) > 11)
 
 
 @pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
