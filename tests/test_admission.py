@@ -188,13 +188,26 @@ def test_stars_are_told_apart_by_coordinates_and_signs():
     )
 
 
-def test_namesakes_with_another_sign_are_two_stars(tmp_path):
-    calints(tmp_path / "a.fits", "BD+20-1790")
-    calints(tmp_path / "b.fits", "BD-20-1790", observation=2, roll=80.0, date="2022-10-03T09:00:00")
-    with pytest.raises(IncompatibleSetupError, match=r"BD\+20-1790 \(1\), BD-20-1790 \(1\)"):
+@pytest.mark.parametrize(
+    ("names", "keys", "arcsec"),
+    [
+        (("HD 1A", "HD 1B"), ("TARG_RA", "TARG_DEC"), 1.5),
+        (("HD 1A", "HD 1B"), ("RA_REF", "DEC_REF"), 4.9),
+        (("BD+20-1790", "BD-20-1790"), None, None),
+    ],
+    ids=["binary", "wide binary", "another sign"],
+)
+def test_stars_near_each_other_or_of_nearly_one_name_are_two(tmp_path, names, keys, arcsec):
+    for k, name in enumerate(names):
+        cards = dict.fromkeys(("TARG_RA", "TARG_DEC")) if keys else {}
+        if keys:
+            cards |= {keys[0]: 100.0, keys[1]: 20.0 + k * arcsec / 3600}
+        another(tmp_path, f"{k}.fits", star=name, observation=k, cards=cards)
+    listed = ", ".join(rf"{re.escape(name)} \(1\)" for name in names)
+    with pytest.raises(IncompatibleSetupError, match=listed):
         dr.Sequence.from_files(tmp_path)
-    sequence = dr.Sequence.from_files(tmp_path, target="BD+20 1790")
-    assert uses(sequence) == {"a.fits": "target", "b.fits": "reference"}
+    sequence = dr.Sequence.from_files(tmp_path, target=names[0])
+    assert uses(sequence) == {"0.fits": "target", "1.fits": "reference"}
 
 
 @pytest.mark.parametrize(
@@ -373,11 +386,15 @@ def test_a_pixel_that_is_missing_at_the_peak_moves_nothing(shared_data, tmp_path
     assert len(sequence.science) == 2
 
 
-def test_a_star_a_few_pixels_from_its_stated_place_is_behind_the_mask(folder):
-    for name, x in (("x.fits", -3.0), ("y.fits", 3.0)):
-        another(folder, name, observation=10 + int(x), light=starlight((x, 0.0)))
-    used = uses(dr.Sequence.from_files(folder))
-    assert used["x.fits"] == used["y.fits"] == "target"
+def test_stars_a_few_pixels_from_their_stated_places_and_in_a_nebula_are_admitted(folder):
+    y, x = np.indices((SIDE, SIDE))
+    nebula = 20 * np.exp(-(((x - 150) ** 2 + (y - 30) ** 2) / 2 / 40**2))
+    lights = (starlight((-3.0, 0.0)), starlight((3.0, 0.0)), starlight() + nebula)
+    for k, light in enumerate(lights, 10):
+        another(folder, f"x{k}.fits", observation=k, light=light)
+    sequence = dr.Sequence.from_files(folder)
+    assert reasons(sequence) == {}
+    assert [uses(sequence)[f"x{k}.fits"] for k in (10, 11, 12)] == ["target"] * 3
 
 
 def test_nothing_usable_is_an_error_with_every_reason_once(folder):
@@ -592,13 +609,6 @@ def test_a_place_of_the_star_is_two_numbers(folder):
         dr.Sequence.from_files(folder, star="here")
 
 
-def test_a_nebula_is_admitted(folder):
-    y, x = np.indices((SIDE, SIDE))
-    nebula = 20 * np.exp(-(((x - 150) ** 2 + (y - 30) ** 2) / 2 / 40**2))
-    another(folder, light=starlight() + nebula)
-    assert reasons(dr.Sequence.from_files(folder)) == {}
-
-
 def without(path, name):
     with fits.open(path, mode="update") as hdus:
         del hdus[name]
@@ -655,21 +665,3 @@ def test_segments_of_an_exposure_are_one_roll(folder):
     assert first.name == f"{FIRST} and 1 more"
     assert len(first.noise_ratios) == len(first) == 2
     assert uses(sequence)["seg2.fits"] == "target"
-
-
-@pytest.mark.parametrize(
-    ("arcsec", "keys"), [(1.5, ("TARG_RA", "TARG_DEC")), (4.9, ("RA_REF", "DEC_REF"))]
-)
-def test_the_stars_of_a_binary_are_two_stars(folder, arcsec, keys):
-    none = {"TARG_RA": None, "TARG_DEC": None}
-    for k, name, away in ((1, "HD 1A", 0.0), (2, "HD 1B", arcsec)):
-        path = folder / (FIRST, SECOND)[k - 1]
-        path.unlink()
-        cards = none | {keys[0]: 100.0, keys[1]: 20.0 + away / 3600}
-        date = f"2022-10-03T0{3 * k}:00:00"
-        calints(path, name, observation=k, roll=60.0 + 10 * k, date=date, cards=cards)
-    with pytest.raises(IncompatibleSetupError, match=r"HD 1A \(1\), HD 1B \(1\)"):
-        dr.Sequence.from_files(folder)
-    sequence = dr.Sequence.from_files(folder, target="HD 1A")
-    assert uses(sequence)[FIRST] == "target"
-    assert uses(sequence)[SECOND] == "reference"

@@ -25,13 +25,7 @@ from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import backend
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.spaceklip import run
-from pyklip_diffrender.spaceklip.database_files import (
-    complete_header,
-    source_table,
-    write_contrast,
-    write_database,
-)
+from pyklip_diffrender.spaceklip import database_files, run
 from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
@@ -127,7 +121,7 @@ def stub_product(folder, filter):
 
 def test_candidates_become_rows_of_spaceklips_table(tmp_path):
     made = fake_detection((-0.3, 0.4), 90.0)
-    table = source_table(made, tmp_path / "x.fits")
+    table = database_files.source_table(made, tmp_path / "x.fits")
     assert list(table["ID"]) == [1, 2]
     # +y points east, and +x north.
     np.testing.assert_allclose(table["RA"][1], 0.4, atol=1e-9)
@@ -146,17 +140,17 @@ def test_products_have_spaceklips_keywords_and_curves(tmp_path):
     product = tmp_path / "x-KLmodes-all.fits"
     header = fits.Header({"PSFCENTX": 20.0, "PSFCENTY": 19.5, "KLMODE0": 1})
     fits.writeto(product, np.zeros((1, SIDE, SIDE)), header)
-    complete_header(product, table, "ADI")
+    database_files.complete_header(product, table, "ADI")
     header = fits.getheader(product)
     assert (header["NINTS"], header["MODE"], header["ANNULI"]) == (2, "ADI", 1)
     assert (header["CRPIX1"], header["CRPIX2"], header["CRVAL1"]) == (21.0, 20.5, 201.0)
     assert (header["CD1_1"], header["CD2_2"]) == pytest.approx((-PIXEL / 3600, PIXEL / 3600))
     assert "BLURFWHM" not in header
-    write_contrast(product, fake_detection((0.1, 0.1), 0.0))
+    database_files.write_contrast(product, fake_detection((0.1, 0.1), 0.0))
     for name, values in (("seps", [0.3, 0.5]), ("cons", [1e-4, 1e-5]), ("maskcons", [1e-4, 1e-5])):
         saved = np.load(tmp_path / f"x-KLmodes-all_cal_{name}.npy")
         np.testing.assert_array_equal(saved, [values])
-    write_database(tmp_path / "x.dat", table)
+    database_files.write_database(tmp_path / "x.dat", table)
     again = Table.read(tmp_path / "x.dat", format="ascii")
     assert list(again["FITSFILE"]) == list(table["FITSFILE"])
     assert again["ALIGN_SHIFT"][0] == "[[0.0, 0.0]]"
