@@ -6,19 +6,12 @@ import numpy as np
 import pytest
 import torch
 from astropy import units as u
-from astropy.nddata import (
-    CCDData,
-    InverseVariance,
-    NDData,
-    StdDevUncertainty,
-    UnknownUncertainty,
-    VarianceUncertainty,
-)
+from astropy.nddata import CCDData, InverseVariance, NDData, StdDevUncertainty
 from astropy.table import Column, MaskedColumn, QTable, Table
 from astropy.utils.masked import Masked
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, ShapeError, UnitError
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError, UnitError
 from pyklip_diffrender.io import native_float64, to_metres, to_unit
 from pyklip_diffrender.io.units import to_mask
 
@@ -41,54 +34,37 @@ def nddata(values, mask, unit):
     return NDData(values, mask=mask, unit=unit)
 
 
-def nddata_of_masked(values, mask, unit):
-    return NDData(values if mask is None else Masked(values, mask=mask), unit=unit)
-
-
 def ccddata(values, mask, unit):
     flags = None if mask is None else np.where(mask, 4, 0)  # Bits of a data-quality array.
     return CCDData(values, mask=flags, unit=unit)
 
 
 def column(values, mask, unit):
-    return (
-        MaskedColumn(values, mask=mask, unit=unit)
-        if mask is not None
-        else Column(values, unit=unit)
-    )
-
-
-def of_qtable(values, mask, unit):
-    return QTable({"flux": quantity(values, mask, unit)})["flux"]
+    return Column(values, unit=unit) if mask is None else MaskedColumn(values, mask=mask, unit=unit)
 
 
 def of_table(values, mask, unit):
-    table = Table({"flux": np.ma.MaskedArray(values, mask=mask) if mask is not None else values})
-    table["flux"].unit = unit
-    return table["flux"]
+    return QTable({"flux": quantity(values, mask, unit)})["flux"]
 
 
-def rows(values, mask, unit):
-    return [
-        quantity(values[k], None if mask is None else mask[k], unit) for k in range(len(values))
-    ]
+def part(mask, k):
+    return None if mask is None else mask[k]
 
 
 def rows_of_ccddata(values, mask, unit):
-    return [ccddata(values[k], None if mask is None else mask[k], unit) for k in range(len(values))]
+    return [ccddata(values[k], part(mask, k), unit) for k in range(3)]
 
 
 def rows_of_rows(values, mask, unit):
-    return [tuple(quantity(values[k], None if mask is None else mask[k], unit)) for k in range(3)]
+    return [tuple(quantity(values[k], part(mask, k), unit)) for k in range(3)]
 
 
 CONTAINERS = [
-    quantity, numpy_masked, nddata, nddata_of_masked, ccddata, column, of_qtable, of_table, rows,
-    rows_of_ccddata, rows_of_rows,
+    quantity, numpy_masked, nddata, ccddata, column, of_table, rows_of_ccddata, rows_of_rows,
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("unit", [None, SURFACE, u.Jy / u.sr], ids=str)
+@pytest.mark.parametrize("unit", [None, u.Jy / u.sr], ids=str)
 @pytest.mark.parametrize("mask", [None, MASK], ids=["all", "masked"])
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_masked_values_are_nan_and_units_are_converted(container, mask, unit):
@@ -105,6 +81,7 @@ def test_masked_values_are_nan_and_units_are_converted(container, mask, unit):
     assert got.dtype == np.float64
     assert got.flags.c_contiguous
     np.testing.assert_allclose(got, factor * expected, rtol=1e-14)
+    got[:] = 7
     np.testing.assert_array_equal(before, VALUES)
     np.testing.assert_allclose(native_float64(value), expected, rtol=1e-14)
     if unit is not None:
@@ -112,12 +89,11 @@ def test_masked_values_are_nan_and_units_are_converted(container, mask, unit):
             to_unit(value, u.s, "data")
 
 
-@pytest.mark.parametrize("container", [quantity, nddata, ccddata, column, rows, rows_of_ccddata])
+@pytest.mark.parametrize("container", [nddata, rows_of_ccddata])
 def test_an_observation_masks_what_its_container_masks(container):
     frame = container(1e6 * VALUES, MASK, u.Jy / u.sr)
-    got = dr.Observation.from_arrays(
-        frame, StdDevUncertainty(VALUES, unit=SURFACE), unit="MJy/sr", pixelscale=0.063
-    )
+    error = StdDevUncertainty(VALUES, unit=SURFACE)
+    got = dr.Observation.from_arrays(frame, error, unit="MJy/sr", pixelscale=0.063)
     np.testing.assert_array_equal(got.valid[0], ~MASK)
     np.testing.assert_allclose(got.data[0], np.where(MASK, 0, VALUES))
     np.testing.assert_allclose(got.error[0], np.where(MASK, 1, VALUES))
@@ -125,9 +101,6 @@ def test_an_observation_masks_what_its_container_masks(container):
 
 def test_a_column_in_centimetres_is_a_length():
     assert to_metres(Table({"x": Column([150.0], unit="cm")})["x"], "x") == pytest.approx([1.5])
-    assert dr.Observation.from_arrays(
-        VALUES, VALUES, pixelscale=Column([63.0, 64.0], unit="mas")
-    ).pixelscale == pytest.approx((0.063, 0.064))
 
 
 def test_masks_of_masks():
@@ -144,15 +117,11 @@ def test_masks_of_masks():
 @pytest.mark.parametrize(
     ("value", "error", "words"),
     [
-        (VALUES + 1j, IncompatibleSetupError, "data: got complex numbers"),
         (Masked(VALUES + 1j, mask=MASK), IncompatibleSetupError, "data: got complex numbers"),
-        (VALUES * (1 + 1j) * u.Jy, IncompatibleSetupError, "data: got complex numbers"),
         (torch.ones(2, dtype=torch.complex128), IncompatibleSetupError, "got complex numbers"),
         ([1.0, 2j], IncompatibleSetupError, "data: got complex numbers"),
         (np.array(["2022-08-11"], "M8[D]"), IncompatibleSetupError, "data: got dates"),
-        (VarianceUncertainty(VALUES), IncompatibleSetupError, "data: got VarianceUncertainty"),
         (InverseVariance(VALUES), IncompatibleSetupError, "got InverseVariance.*represent_as"),
-        (UnknownUncertainty(VALUES), IncompatibleSetupError, "data: got UnknownUncertainty"),
         (object(), IncompatibleSetupError, "data: got object"),
         (["a", "b"], IncompatibleSetupError, "data: got list.*expected real numbers"),
         ([1 * SURFACE, 2.0], UnitError, "data: got values with a unit and others without"),
@@ -162,9 +131,8 @@ def test_masks_of_masks():
     ],
 )
 def test_what_cannot_be_taken_is_refused_by_name(value, error, words):
-    with pytest.raises(error, match=words) as caught:
+    with pytest.raises(error, match=words):
         to_unit(value, SURFACE, "data")
-    assert isinstance(caught.value, DiffrenderError)
 
 
 def test_a_position_in_another_unit_than_pixels_is_refused():

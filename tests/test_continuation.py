@@ -59,31 +59,19 @@ def shot(k=0, planet=None, cycles=CYCLES[0]):
         expected = expected + turned.contrast * star(tuple(np.add(OFFSET, turned.offset)))
     rng = np.random.default_rng(20 + k)
     counts = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
+    error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
     return Observation.from_arrays(
-        counts,
-        np.sqrt(np.maximum(counts, 0) + READ_NOISE**2),
-        pixelscale=model().detector.pixelscale,
+        counts, error, pixelscale=model().detector.pixelscale, name=f"roll {k}",
         position_angles=np.array([k * ROLL]),
-        name=f"roll {k}",
-    )
+    )  # fmt: skip
 
 
 def settings(**changes):
     return GaussNewton(**{"cycles": CYCLES, "response_npix": 64, **changes})
 
 
-def pulls(fit, k, truth):
-    """Error of the fitted star in frame k, in sigma."""
-    return (fit.frames[k].star - truth) / np.sqrt(truth + READ_NOISE**2)
-
-
 @pytest.mark.parametrize(
-    ("grown", "count"),
-    [
-        pytest.param(False, 1, marks=pytest.mark.slow),
-        pytest.param(True, 1, marks=pytest.mark.slow),
-        (False, 2),
-    ],
+    ("grown", "count"), [pytest.param(True, 1, marks=pytest.mark.slow), (False, 2)]
 )
 def test_every_way_a_fit_can_go_on(grown, count):
     """Basis grown, where the wavefront has finer modes, or not, one frame or two."""
@@ -92,10 +80,12 @@ def test_every_way_a_fit_can_go_on(grown, count):
     assert fit.status is Status.CONVERGED
     assert len(fit.basis) == len(default_basis(CYCLES[grown]))
     assert fit.settings.cycles == CYCLES[grown:]
-    for k, frame in enumerate(fit.frames):
+    truth = star(cycles=CYCLES[grown])
+    for frame in fit.frames:
         np.testing.assert_allclose(frame.render(), frame.star, rtol=1e-9)
+        pulls = (frame.star - truth) / np.sqrt(truth + READ_NOISE**2)
         # Most of a star model's error is that of the modes that the data determine.
-        assert np.sqrt(np.mean(pulls(fit, k, star(cycles=CYCLES[grown])) ** 2)) < 0.6
+        assert np.sqrt(np.mean(pulls**2)) < 0.6
     assert len(fit.linear.vector) == len(fit.linear.unknowns)
     again = refine_again(fit, max_iterations=4)
     assert len(again.basis) == len(fit.basis)
@@ -105,12 +95,8 @@ def test_every_way_a_fit_can_go_on(grown, count):
 @pytest.mark.slow
 def test_drifts_and_a_known_companion_go_on():
     drift = WavefrontPrior(scales={"segment": 0.5, "texture": 0.02})
-    fit = dr.refine(
-        model(),
-        [shot(k, PLANET) for k in range(2)],
-        before(),
-        settings=settings(cycles=4.0, drift=drift, drift_cycles=2.0, companions=(PLANET,)),
-    )
+    own = settings(cycles=4.0, drift=drift, drift_cycles=2.0, companions=(PLANET,))
+    fit = dr.refine(model(), [shot(k, PLANET) for k in range(2)], before(), settings=own)
     assert fit.status is Status.CONVERGED
     assert set(fit.scales) == {"segment", "texture", "segment drift", "texture drift"}
     again = refine_again(fit, max_iterations=4)
@@ -129,21 +115,14 @@ def test_a_companion_can_be_added_to_a_fit():
     assert len(again.companions) == 1
     assert abs(again.companions[0, 0] - 3e-4) < 4 * again.companion_errors[0, 0]
     assert again.chi2_per_pixel < fit.chi2_per_pixel
-
-
-@pytest.mark.slow
-def test_a_fit_that_fails_is_not_searched():
-    dark = replace(shot(), data=-shot().data)
-    fit = dr.refine(model(), dark, before(), settings=settings())
-    assert fit.status is Status.DIVERGED
     with pytest.raises(IncompatibleSetupError, match="the fit ended as DIVERGED"):
-        dr.detect(fit)
+        dr.detect(replace(fit, status=Status.DIVERGED))
 
 
-@pytest.mark.parametrize("change", [{}, {"wavefront": False}], ids=["wavefront", "alignment"])
-def test_a_fit_with_a_basis_of_its_own_can_go_on(change):
+@pytest.mark.parametrize("wavefront", [True, False], ids=["wavefront", "alignment"])
+def test_a_fit_with_a_basis_of_its_own_can_go_on(wavefront):
     """A basis without segments: the prior of those stays as it was."""
-    own = settings(basis=FourierModes(3), max_iterations=6, **change)
+    own = settings(basis=FourierModes(3), max_iterations=6, wavefront=wavefront)
     fit = dr.refine(model(), shot(), before(), settings=own)
     again = refine_again(fit, wavefront=True, max_iterations=12)
     assert again.chi2_per_pixel < 1.001 * fit.chi2_per_pixel
@@ -152,7 +131,7 @@ def test_a_fit_with_a_basis_of_its_own_can_go_on(change):
     assert scales["segment"] == own.prior.scales["segment"]
     assert scales["texture"] == fit.scales["texture"]
     # It began where the other had ended.
-    if not change:
+    if wavefront:
         first = again.history[0]["chi2_per_pixel"]
         assert first == pytest.approx(fit.chi2_per_pixel, rel=0.01)
         assert first < 0.9 * fit.history[0]["chi2_per_pixel"]
@@ -179,19 +158,12 @@ def test_a_fit_goes_on_from_where_it_ended():
     assert again.chi2_per_pixel == pytest.approx(fit.chi2_per_pixel, rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        ({"settings": "gauss-newton"}, r"settings: got a str, expected GaussNewton"),
-        ({"start": [{}, {}, {}]}, r"start: got 3 dicts for 2 observations"),
-    ],
-)
-def test_arguments_that_do_not_go_together_are_refused(arguments, complaint):
-    with pytest.raises(ValueError, match=complaint):
-        dr.refine(model(), [shot(0), shot(1)], before(), **arguments)
-
-
-def test_arguments_in_another_order_are_refused():
+def test_arguments_that_do_not_go_together_are_refused():
+    frames = [shot(0), shot(1)]
+    with pytest.raises(IncompatibleSetupError, match=r"settings: got a str, expected GaussNewton"):
+        dr.refine(model(), frames, before(), settings="gauss-newton")
+    with pytest.raises(ValueError, match=r"start: got 3 dicts for 2 observations"):
+        dr.refine(model(), frames, before(), start=[{}, {}, {}])
     with pytest.raises(IncompatibleSetupError, match="order of the arguments"):
         dr.refine(before(), shot(), model())
 
@@ -209,7 +181,6 @@ BAD = [
     ({"relinearise": math.nan}, r"relinearise: got nan"),
     ({"response_npix": -64}, r"response_npix: got -64"),
     ({"min_model_error": -0.01}, r"min_model_error: got -0\.01, expected 0 or more"),
-    ({"min_model_error": math.nan}, r"min_model_error: got nan, expected 0 or more"),
     ({"accurate_steps": 0.1}, r"accurate_steps: got 0\.1, expected True or False"),
     ({"grow_basis": None}, r"grow_basis: got None, expected True or False"),
     ({"max_companions": -1}, r"max_companions: got -1, expected 0 or more"),
@@ -230,15 +201,13 @@ def test_settings_that_cannot_be_are_refused_when_they_are_made(changes, complai
 
 def test_modes_of_the_preset_reach_the_edge_of_the_fitted_square():
     expected = {"F444W": 18, "F480M": 16, "F356W": 22, "F250M": 32, "F210M": 18}
-    for name, cycles in expected.items():
-        assert GaussNewton.nircam(name).cycles == (cycles,)
+    assert {name: GaussNewton.nircam(name).cycles[0] for name in expected} == expected
     assert GaussNewton.nircam() == GaussNewton.nircam("F444W")
-    for name in ("F44W", "CLEAR", ""):
-        with pytest.raises(IncompatibleSetupError, match=r"filter: got .*F444W"):
-            GaussNewton.nircam(name)
+    with pytest.raises(IncompatibleSetupError, match=r"filter: got .*F444W"):
+        GaussNewton.nircam("F44W")
 
 
-@pytest.mark.parametrize("cycles", [6, 6.0, (6,), [6.0], np.float64(6)])
+@pytest.mark.parametrize("cycles", [6, [6.0], np.float64(6)])
 def test_a_single_number_of_cycles_will_do(cycles):
     made = GaussNewton(cycles=cycles, free=["flux"], companions=[PLANET])
     assert made == GaussNewton(cycles=(6.0,), free=("flux",), companions=(PLANET,))

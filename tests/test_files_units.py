@@ -10,172 +10,75 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from astropy import units as u
 from astropy.io import fits
 
-from pyklip_diffrender.errors import (
-    CorruptFileError,
-    DiffrenderError,
-    NonFiniteError,
-    ShapeError,
-    UnitError,
-)
+from pyklip_diffrender.errors import CorruptFileError, NonFiniteError
 from pyklip_diffrender.io import (
-    embedded_table,
     native_float64,
     open_fits,
     replacing,
     require_finite,
-    require_shape,
     sha256,
-    to_arcsec,
     to_metres,
     write_fits,
 )
 
 
-def written(path, value=1.0, size=64):
-    """A small FITS file with a header, an image and a second extension."""
-    data = value * np.arange(size * size, dtype=np.float32).reshape(size, size)
+def written(path):
+    data = np.arange(64 * 64, dtype=np.float32).reshape(64, 64)
     hdus = [fits.PrimaryHDU(), fits.ImageHDU(data, name="A"), fits.ImageHDU(-data, name="B")]
     fits.HDUList(hdus).writeto(path)
     return path
-
-
-@pytest.mark.parametrize(
-    ("value", "metres"),
-    [(3.0, 3.0), (3 * u.um, 3e-6), (3 * u.nm, 3e-9), (3 * u.AA, 3e-10), (0.003 * u.mm, 3e-6)],
-)
-def test_lengths_become_metres(value, metres):
-    assert float(to_metres(value, "opd")) == pytest.approx(metres, rel=1e-15)
-
-
-def test_a_list_of_quantities_of_mixed_units_keeps_each_unit():
-    np.testing.assert_allclose(
-        to_metres([1 * u.um, 2 * u.nm, 3 * u.m], "opd"), [1e-6, 2e-9, 3.0], rtol=1e-15
-    )
-    np.testing.assert_allclose(to_arcsec((20 * u.mas, 1 * u.arcmin), "x"), [0.02, 60], rtol=1e-15)
-
-
-@pytest.mark.parametrize("bad", [1 * u.s, np.ones(3) * u.kg, 5 * u.arcsec])
-def test_a_unit_that_does_not_convert_is_named_with_the_expected_one(bad):
-    with pytest.raises(UnitError, match=rf"opd: got the unit '{bad.unit}'.*'m'") as caught:
-        to_metres(bad, "opd")
-    assert isinstance(caught.value, ValueError | DiffrenderError)
-
-
-@pytest.fixture
-def plain():
-    # Multiples of 1/4 below 2^14: exact in every type that is tried.
-    return np.arange(-24, 24, dtype=np.float64).reshape(6, 8) / 4
 
 
 @pytest.mark.hard
 @pytest.mark.parametrize(
     "dress",
     [
-        lambda a: a.astype(">f8"),
-        lambda a: a.astype(">f4"),
-        lambda a: a.astype(np.float32),
-        lambda a: np.asfortranarray(a),
-        lambda a: np.repeat(a, 2, axis=1)[:, ::2],
-        lambda a: torch.from_numpy(a).requires_grad_(),
-        lambda a: a.tolist(),
-        lambda a: np.ma.masked_array(a, np.zeros(a.shape, dtype=bool)),
+        lambda a, path: a.astype(">f4"),
+        lambda a, path: np.asfortranarray(a),
+        lambda a, path: np.repeat(a, 2, axis=1)[:, ::2],
+        lambda a, path: torch.from_numpy(a).requires_grad_(),
+        lambda a, path: a.tolist(),
+        lambda a, path: np.memmap(path, dtype=">f8", mode="r", shape=a.shape),
     ],
-    ids=["f8be", "f4be", "f4", "fortran", "strided", "tensor", "list", "masked"],
+    ids=["f4be", "fortran", "strided", "tensor", "list", "read-only map"],
 )
-def test_every_kind_of_array_becomes_the_same_native_copy(dress, plain):
-    got = native_float64(dress(plain))
+def test_every_kind_of_array_becomes_the_same_native_copy(dress, tmp_path):
+    # Multiples of 1/4 below 2^14: exact in every type that is tried.
+    plain = np.arange(-24, 24, dtype=np.float64).reshape(6, 8) / 4
+    plain.astype(">f8").tofile(tmp_path / "map.dat")
+    value = dress(plain.copy(), tmp_path / "map.dat")
+    got = native_float64(value)
     np.testing.assert_array_equal(got, plain)
     assert got.dtype == np.dtype("=f8")
     assert got.dtype.isnative
     assert got.flags.c_contiguous
-    assert got.flags.writeable
-    torch.from_numpy(got)
-
-
-@pytest.mark.hard
-def test_a_memory_mapped_read_only_file_is_copied(tmp_path, plain):
-    path = tmp_path / "map.dat"
-    plain.astype(">f8").tofile(path)
-    mapped = np.memmap(path, dtype=">f8", mode="r", shape=plain.shape)
-    got = native_float64(mapped)
-    got += 1
-    np.testing.assert_array_equal(mapped, plain)
     assert not isinstance(got, np.memmap)
+    torch.from_numpy(got)[:] = 7
+    to_metres(value, "x")[:] = 7
+    # What was given stays as it is.
+    np.testing.assert_array_equal(native_float64(value), plain)
 
 
-def test_the_input_is_never_modified(plain):
-    before = plain.copy()
-    native_float64(plain)[:] = 7
-    to_metres(plain, "x")[:] = 7
-    quantity = plain * u.m
-    to_metres(quantity, "x")[:] = 7
-    tensor = torch.from_numpy(plain)
-    native_float64(tensor)[:] = 7
-    np.testing.assert_array_equal(plain, before)
-    np.testing.assert_array_equal(quantity.value, before)
-
-
-def test_masked_values_become_nan():
-    masked = np.ma.masked_array([1, 2, 3], mask=[False, True, False])
-    np.testing.assert_array_equal(native_float64(masked), [1.0, np.nan, 3.0])
-    assert masked.data[1] == 2
-
-
-def test_require_shape_says_what_was_got_what_was_expected_and_what_to_do():
-    require_shape(np.empty((3, 4)), (None, 4), "data", "Turn it.")
-    with pytest.raises(ShapeError, match=r"data: got shape \(3, 4\).*\('any', 5\).*Turn it"):
-        require_shape(np.empty((3, 4)), (None, 5), "data", "Turn it.")
-    with pytest.raises(ShapeError, match=r"\(3, 4\)"):
-        require_shape(np.empty((3, 4)), (3, 4, 1), "data", "")
-
-
-def test_require_finite_counts_and_locates():
+def test_values_that_are_not_finite_are_counted_and_located():
     array = np.zeros((5, 6))
     array[2, 3], array[4, 1], array[0, 5] = np.nan, np.inf, -np.inf
     with pytest.raises(NonFiniteError, match=r"map: 3 values.*\(0, 5\)"):
         require_finite(array, "map")
-    where = np.zeros((5, 6), dtype=bool)
-    require_finite(array, "map", where)
-    where[2:] = True
     with pytest.raises(NonFiniteError, match=r"map: 2 values.*\(2, 3\)"):
-        require_finite(array, "map", where)
+        require_finite(array, "map", np.arange(30).reshape(5, 6) > 11)
 
 
 @pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
-def test_a_whole_file_is_read_and_usable_afterwards(tmp_path, suffix):
-    path = written(tmp_path / f"whole{suffix}")
-    with open_fits(path) as hdus:
-        kept = hdus["B"].data
-        assert [hdu.name for hdu in hdus] == ["PRIMARY", "A", "B"]
-    assert kept[63, 63] == -4095.0
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("percent", [25, 50, 99])
-@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
-def test_a_truncated_file_is_an_error_that_names_it(tmp_path, suffix, percent):
-    whole = written(tmp_path / f"whole{suffix}").read_bytes()
-    cut = tmp_path / f"cut{suffix}"
-    cut.write_bytes(whole[: len(whole) * percent // 100])
+def test_a_truncated_file_is_an_error_that_names_it(tmp_path, suffix):
+    path = written(tmp_path / f"cut{suffix}")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 99 // 100])
     complaint = pytest.raises(CorruptFileError, match=r"cut\.fits.*not a complete FITS file")
-    with complaint as caught, open_fits(cut):
+    with complaint as caught, open_fits(path):
         pass
     assert isinstance(caught.value, OSError)
-    assert str(cut.stat().st_size) in str(caught.value)
-
-
-@pytest.mark.hard
-def test_damaged_compression_is_a_corrupt_file(tmp_path):
-    path = written(tmp_path / "damaged.fits.gz")
-    whole = bytearray(path.read_bytes())
-    for place in range(len(whole) // 3, len(whole) // 3 + 40):
-        whole[place] ^= 0xFF
-    path.write_bytes(bytes(whole))
-    with pytest.raises(CorruptFileError, match=r"damaged\.fits\.gz"), open_fits(path):
-        pass
+    assert str(path.stat().st_size) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +123,8 @@ def test_a_written_file_reads_back_and_leaves_nothing_else(tmp_path, suffix):
     assert [p.name for p in path.parent.iterdir()] == [path.name]
     assert (path.read_bytes()[:2] == b"\x1f\x8b") == (suffix == ".fits.gz")
     with open_fits(path) as hdus:
-        np.testing.assert_array_equal(hdus[0].data, 2 * data)
+        kept = hdus[0].data
+    np.testing.assert_array_equal(kept, 2 * data)
 
 
 @pytest.fixture
@@ -304,13 +208,3 @@ def test_a_process_killed_while_writing_leaves_the_old_product_intact(tmp_path, 
         path,
     )
     assert sha256(path) == before
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["jwst_primary_polygons", "nircam_filters", "nircam_maskrnd_openings", "nircam_si_zernikes"],
-)
-def test_embedded_tables_say_where_they_come_from(name):
-    table = embedded_table(name)
-    assert len(table) > 0
-    assert table.meta

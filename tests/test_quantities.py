@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +10,7 @@ import torch
 from astropy import units as u
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.errors import (
-    DiffrenderError,
-    IncompatibleSetupError,
-    NonFiniteError,
-    ShapeError,
-    UnitError,
-)
+from pyklip_diffrender.errors import IncompatibleSetupError, NonFiniteError, ShapeError, UnitError
 from pyklip_diffrender.io import to_number, to_pair
 from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.wavefront import SegmentMotions, as_opd_map, random_drift
@@ -38,9 +29,8 @@ def coronagraph(**arguments):
 
 
 def observation(**details):
-    made = dr.Observation.from_arrays(
-        np.ones((2, 4, 4)), np.ones((2, 4, 4)), **{"pixelscale": 0.06} | details
-    )
+    ones = np.ones((2, 4, 4))
+    made = dr.Observation.from_arrays(ones, ones, **{"pixelscale": 0.06} | details)
     return [made.pixelscale, made.star_offset, made.position_angles]
 
 
@@ -63,161 +53,110 @@ def prior(**arguments):
     return sorted(learned.scales.values())
 
 
-@dataclass
-class Case:
-    """A call with Quantities, and the numbers that they are in the units of the interface."""
-
-    call: Callable[..., Any]
-    quantities: dict[str, Any]
-    numbers: dict[str, Any]
-
-
 CASES = {
-    "Planet": Case(
-        dr.Planet,
-        {"contrast": 1e-4 * u.percent, "separation": 600 * u.mas, "position_angle": 0.5 * u.rad},
-        {"contrast": 1e-6, "separation": 0.6, "position_angle": math.degrees(0.5)},
-    ),
-    "Planet.from_offset": Case(
-        lambda **given: dr.Planet.from_offset(1e-6, **given),
-        {"x": -300 * u.mas, "y": 0.01 * u.arcmin},
-        {"x": -0.3, "y": 0.6},
-    ),
-    "Planet.rotated": Case(dr.Planet(1e-6, 0.6).rotated, {"angle": 6 * u.arcmin}, {"angle": 0.1}),
-    "Star": Case(
-        dr.Star,
-        {
-            "w2_magnitude": 4 * u.mag,
-            "exposure": 2 * u.h,
-            "zero_point": 184100 * u.mJy,
-            "pixel_area": 0.004 * u.arcsec**2,
-            "gain": 1.8 * u.electron / u.ct,
-        },
-        {
-            "w2_magnitude": 4,
-            "exposure": 7200.0,
-            "zero_point": 184.1,
-            "pixel_area": 0.004 * (math.pi / 648000) ** 2,
-            "gain": 1.8,
-        },
-    ),
-    "Scene": Case(
-        dr.Scene,
-        {"star_offset": [5, -20] * u.mas, "read_noise": 9 * u.photon, "background": 2 * u.photon},
-        {"star_offset": (0.005, -0.02), "read_noise": 9, "background": 2},
-    ),
-    "nircam_coronagraph, one wavelength": Case(
-        coronagraph,
-        {
-            "monochromatic": 4.5 * u.um,
-            "pixelscale": 63 * u.mas,
-            "segment_gap": 7 * u.mm,
-            "chromatic_reference": 3350 * u.nm,
-            "si_wfe": np.linspace(-9, 9, 36) * u.nm,
-        },
-        {
-            "monochromatic": 4.5e-6,
-            "pixelscale": 0.063,
-            "segment_gap": 0.007,
-            "chromatic_reference": 3.35e-6,
-            "si_wfe": np.linspace(-9e-9, 9e-9, 36),
-        },
-    ),
-    "nircam_coronagraph, field and source": Case(
-        coronagraph,
-        {"fov_arcsec": 400 * u.mas, "pixelscale": [62, 63] * u.mas, "source": 4 * u.kK},
-        {"fov_arcsec": 0.4, "pixelscale": (0.062, 0.063), "source": 4000},
-    ),
-    "nircam_coronagraph, spectrum": Case(
-        coronagraph,
-        {"source": ([3, 4, 6] * u.um, [1e4, 3e4, 2e4] * u.photon / u.s / u.cm**2 / u.m)},
-        {"source": ([3e-6, 4e-6, 6e-6], [1, 3, 2])},
-    ),
-    "random_opd": Case(
-        lambda rms: dr.random_opd(1, npix=32, rms=rms).data, {"rms": 50 * u.nm}, {"rms": 5e-8}
-    ),
-    "random_drift": Case(
-        lambda hours: random_drift(1, hours, npix=32).data, {"hours": 90 * u.min}, {"hours": 1.5}
-    ),
-    "learn_prior": Case(
-        prior,
-        {"maps": [OPD * 0 * u.m, OPD * 1e9 * u.nm], "diameter": 660 * u.cm},
-        {"maps": [OPD * 0, OPD], "diameter": 6.6},
-    ),
-    "WavefrontPrior": Case(
-        dr.WavefrontPrior,
-        {"scales": {"segment": 4e-9 * u.m, "texture": 1e-4 * u.um}, "amplitude_scale": 2 * u.nm},
-        {"scales": {"segment": 4.0, "texture": 0.1}, "amplitude_scale": 2.0},
-    ),
-    "GaussNewton": Case(
-        lambda **given: dr.GaussNewton(deviations=given).deviations,
-        {"star_offset": 3 * u.mas, "lyot_rotation": 12 * u.arcmin, "flux": 5 * u.percent},
-        {"star_offset": 0.003, "lyot_rotation": 0.2, "flux": 0.05},
-    ),
-    "Observation": Case(
-        observation,
-        {
-            "pixelscale": [62, 63] * u.mas,
-            "star_offset": [10, -20] * u.mas,
-            "position_angles": [0.5, 0.6] * u.rad,
-        },
-        {
-            "pixelscale": (0.062, 0.063),
-            "star_offset": (0.01, -0.02),
-            "position_angles": np.degrees([0.5, 0.6]),
-        },
-    ),
-    "refine, start": Case(
-        problem,
-        {
-            "star_offset": [10, -20] * u.mas,
-            "lyot_rotation": 6 * u.arcmin,
-            "flux": 2e6 * u.Jy / u.sr,
-            "background": 3e3 * u.Jy / u.sr,
-        },
-        {"star_offset": (0.01, -0.02), "lyot_rotation": 0.1, "flux": 2.0, "background": 0.003},
-    ),
-}
+    "Planet": (dr.Planet, {
+        "contrast": (1e-4 * u.percent, 1e-6),
+        "separation": (600 * u.mas, 0.6),
+        "position_angle": (0.5 * u.rad, math.degrees(0.5)),
+    }),
+    "Planet.from_offset": (lambda **given: dr.Planet.from_offset(1e-6, **given), {
+        "x": (-300 * u.mas, -0.3),
+        "y": (0.01 * u.arcmin, 0.6),
+    }),
+    "Planet.rotated": (dr.Planet(1e-6, 0.6).rotated, {"angle": (6 * u.arcmin, 0.1)}),
+    "Star": (dr.Star, {
+        "w2_magnitude": (4 * u.mag, 4),
+        "exposure": (2 * u.h, 7200.0),
+        "zero_point": (184100 * u.mJy, 184.1),
+        "pixel_area": (0.004 * u.arcsec**2, 0.004 * (math.pi / 648000) ** 2),
+        "gain": (1.8 * u.electron / u.ct, 1.8),
+    }),
+    "Scene": (dr.Scene, {
+        "star_offset": ([5, -20] * u.mas, (0.005, -0.02)),
+        "read_noise": (9 * u.photon, 9),
+        "background": (2 * u.photon, 2),
+    }),
+    "nircam_coronagraph, one wavelength": (coronagraph, {
+        "monochromatic": (4.5 * u.um, 4.5e-6),
+        "pixelscale": (63 * u.mas, 0.063),
+        "segment_gap": (7 * u.mm, 0.007),
+        "chromatic_reference": (3350 * u.nm, 3.35e-6),
+        "si_wfe": (np.linspace(-9, 9, 36) * u.nm, np.linspace(-9e-9, 9e-9, 36)),
+    }),
+    "nircam_coronagraph, field and source": (coronagraph, {
+        "fov_arcsec": (400 * u.mas, 0.4),
+        "pixelscale": ([62, 63] * u.mas, (0.062, 0.063)),
+        "source": (4 * u.kK, 4000),
+    }),
+    "nircam_coronagraph, spectrum": (coronagraph, {
+        "source": (
+            ([3, 4, 6] * u.um, [1e4, 3e4, 2e4] * u.photon / u.s / u.cm**2 / u.m),
+            ([3e-6, 4e-6, 6e-6], [1, 3, 2]),
+        ),
+    }),
+    "random_opd": (lambda rms: dr.random_opd(1, npix=32, rms=rms).data, {"rms": (50 * u.nm, 5e-8)}),
+    "random_drift": (lambda hours: random_drift(1, hours, npix=32).data, {
+        "hours": (90 * u.min, 1.5),
+    }),
+    "learn_prior": (prior, {
+        "maps": ([OPD * 0 * u.m, OPD * 1e9 * u.nm], [OPD * 0, OPD]),
+        "diameter": (660 * u.cm, 6.6),
+    }),
+    "WavefrontPrior": (dr.WavefrontPrior, {
+        "scales": (
+            {"segment": 4e-9 * u.m, "texture": 1e-4 * u.um}, {"segment": 4.0, "texture": 0.1},
+        ),
+        "amplitude_scale": (2 * u.nm, 2.0),
+    }),
+    "GaussNewton": (lambda **given: dr.GaussNewton(deviations=given).deviations, {
+        "star_offset": (3 * u.mas, 0.003),
+        "lyot_rotation": (12 * u.arcmin, 0.2),
+        "flux": (5 * u.percent, 0.05),
+    }),
+    "Observation": (observation, {
+        "pixelscale": ([62, 63] * u.mas, (0.062, 0.063)),
+        "star_offset": ([10, -20] * u.mas, (0.01, -0.02)),
+        "position_angles": ([0.5, 0.6] * u.rad, np.degrees([0.5, 0.6])),
+    }),
+    "refine, start": (problem, {
+        "star_offset": ([10, -20] * u.mas, (0.01, -0.02)),
+        "lyot_rotation": (6 * u.arcmin, 0.1),
+        "flux": (2e6 * u.Jy / u.sr, 2.0),
+        "background": (3e3 * u.Jy / u.sr, 0.003),
+    }),
+}  # fmt: skip
+"""A call, and its arguments as Quantities and as numbers in the units of the interface."""
 
 
-def plain(value):
-    """Numbers inside dataclasses and lists, for a comparison."""
+def flat(value):
+    """Numbers and words in dataclasses, dictionaries and lists."""
     if hasattr(value, "__dataclass_fields__"):
-        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__}
+        value = vars(value)
     if isinstance(value, dict):
-        return {key: plain(each) for key, each in value.items()}
+        value = [*value, *value.values()]
     if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    return value
-
-
-def assert_same(got, expected):
-    if isinstance(expected, dict):
-        assert got.keys() == expected.keys()
-        for key in expected:
-            assert_same(got[key], expected[key])
-    elif isinstance(expected, list):
-        assert len(got) == len(expected)
-        for one, other in zip(got, expected, strict=True):
-            assert_same(one, other)
-    elif isinstance(expected, float | int | np.ndarray) and not isinstance(expected, bool):
-        assert not isinstance(got, u.Quantity)
-        np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-30)
-    else:
-        assert got == expected
+        return [each for member in value for each in flat(member)]
+    return [value]
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_quantity_is_the_number_in_the_unit_of_the_interface(name):
-    case = CASES[name]
-    assert_same(plain(case.call(**case.quantities)), plain(case.call(**case.numbers)))
+    call, arguments = CASES[name]
+    quantities, numbers = ({key: each[k] for key, each in arguments.items()} for k in (0, 1))
+    for got, expected in zip(flat(call(**quantities)), flat(call(**numbers)), strict=True):
+        if isinstance(expected, float | int | np.ndarray):
+            assert not isinstance(got, u.Quantity)
+            np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-30)
+        else:
+            assert got == expected
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_another_dimension_is_refused_by_name(name):
     """One argument after the other in a unit that no argument has."""
-    case = CASES[name]
-    for key, value in case.quantities.items():
+    call, arguments = CASES[name]
+    numbers = {key: number for key, (_, number) in arguments.items()}
+    for key, (value, _) in arguments.items():
         wrong = 1 * u.K if key != "source" else 1 * u.m
         if key == "maps":
             wrong = [OPD * u.K, OPD * u.K]
@@ -228,7 +167,7 @@ def test_another_dimension_is_refused_by_name(name):
         elif isinstance(value, u.Quantity) and value.shape:
             wrong = value.value * u.K
         with pytest.raises(UnitError, match=key):
-            case.call(**{**case.numbers, key: wrong})
+            call(**{**numbers, key: wrong})
 
 
 @pytest.mark.parametrize(
@@ -236,21 +175,18 @@ def test_another_dimension_is_refused_by_name(name):
     [
         (lambda: dr.Planet(-1e-6, 0.6), r"contrast: got -1e-06, expected 0 or more"),
         (lambda: dr.Planet(1e-6, -600 * u.mas), r"separation: got -0.6 arcsec, expected 0 or"),
-        (lambda: dr.Planet(math.nan, 0.6), r"contrast: got nan, expected a finite number"),
         (lambda: dr.Star(exposure=0), r"exposure: got 0 s, expected a positive number"),
         (lambda: dr.Scene(read_noise=-1), r"read_noise: got -1 ph, expected 0 or more"),
         (lambda: dr.nircam_coronagraph(pixelscale=-0.06), r"pixelscale: got -0.06 arcsec"),
         (lambda: dr.nircam_coronagraph(fov_arcsec=0), r"fov_arcsec: got 0 arcsec"),
         (lambda: dr.nircam_coronagraph(source=-5 * u.K), r"source: got -5 K"),
-        (lambda: dr.reduce("nowhere", OPD, threshold=-5), r"threshold: got -5, expected a pos"),
         (lambda: dr.reduce("nowhere", OPD, threshold=0), r"threshold: got 0, expected a pos"),
         (lambda: dr.WavefrontPrior({"segment": -4}), r"scales: segment: got -4 nm"),
     ],
 )
 def test_values_out_of_bounds_say_what_was_got_and_expected(call, words):
-    with pytest.raises(DiffrenderError, match=words) as caught:
+    with pytest.raises(ValueError, match=words):
         call()
-    assert isinstance(caught.value, ValueError)
 
 
 def test_memory_is_text_a_quantity_or_bytes():
@@ -269,13 +205,18 @@ def test_single_numbers_and_pairs():
     assert to_number(np.array([3.0]), u.m, "x") == 3.0
     assert to_pair(3 * u.mas, u.arcsec, "x") == (0.003, 0.003)
     assert to_pair([3 * u.mas, 1 * u.arcsec], u.mas, "x") == pytest.approx((3.0, 1000.0))
-    with pytest.raises(ShapeError, match=r"x: got shape \(2,\), expected a single number"):
-        to_number([1, 2], u.m, "x")
-    with pytest.raises(ShapeError, match=r"x: got 'far', expected a number"):
-        to_number("far", u.m, "x")
-    with pytest.raises(ShapeError, match=r"x: got shape \(3,\), expected one number or two"):
-        to_pair([1, 2, 3], u.m, "x")
-    with pytest.raises(NonFiniteError, match="inf"):
-        to_number(math.inf, u.m, "x")
-    with pytest.raises(IncompatibleSetupError, match="x: got 0 m, expected a positive number"):
-        to_number(0, u.m, "x", "positive")
+
+
+@pytest.mark.parametrize(
+    ("read", "value", "error", "words"),
+    [
+        (to_number, [1, 2], ShapeError, r"x: got shape \(2,\), expected a single number"),
+        (to_number, "far", ShapeError, r"x: got 'far', expected a number"),
+        (to_pair, [1, 2, 3], ShapeError, r"x: got shape \(3,\), expected one number or two"),
+        (to_number, math.inf, NonFiniteError, "x: got inf, expected a finite number"),
+        (to_number, 0, IncompatibleSetupError, "x: got 0 m, expected a positive number"),
+    ],
+)
+def test_what_is_no_number_is_refused(read, value, error, words):
+    with pytest.raises(error, match=words):
+        read(value, u.m, "x", "positive")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +12,7 @@ import torch
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
 from pyklip.instruments import JWST
+from small_files import calints as small_calints
 from synthetic_searches import searched
 
 from benchmarks.calints_files import calints
@@ -25,13 +25,7 @@ from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import backend
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.spaceklip import run
-from pyklip_diffrender.spaceklip.database_files import (
-    complete_header,
-    source_table,
-    write_contrast,
-    write_database,
-)
+from pyklip_diffrender.spaceklip import database_files, run
 from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
@@ -68,26 +62,18 @@ def frame(path, data, roll):
     """Write a stage-2 file with the star where spaceKLIP puts it."""
     center = (SIDE + 1) / 2
     primary = {
-        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "FILTER": "F444W",
-        "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "DATE-BEG": "2022-07-30T01:02:03",
+        "TELESCOP": "JWST", "EXP_TYPE": "NRC_CORON", "PUPIL": "MASKRND", "CORONMSK": "MASKA335R",
         "TARGPROP": "STAR", "XOFFSET": 0.0, "YOFFSET": 0.0,
     }  # fmt: skip
     science = {
-        "BUNIT": "MJy/sr", "PIXAR_SR": 9.2e-14, "PIXAR_A2": PIXEL**2,
-        "STARCENX": center, "STARCENY": center,
+        "PIXAR_SR": 9.2e-14, "PIXAR_A2": PIXEL**2, "STARCENX": center, "STARCENY": center,
         "CRPIX1": center, "CRPIX2": center, "CRVAL1": 201.0, "CRVAL2": -51.0, "ROLL_REF": roll,
-        "V3I_YANG": 0.0, "VPARITY": -1, "WCSAXES": 2, "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN",
+        "V3I_YANG": 0.0, "WCSAXES": 2, "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN",
         "CUNIT1": "deg", "CUNIT2": "deg", "CD1_1": -PIXEL / 3600, "CD1_2": 0.0, "CD2_1": 0.0,
         "CD2_2": PIXEL / 3600,
     }  # fmt: skip
-    hdus = [
-        fits.PrimaryHDU(header=fits.Header(primary)),
-        fits.ImageHDU(data.astype(np.float32)[None], fits.Header(science), name="SCI"),
-        fits.ImageHDU(np.sqrt(data).astype(np.float32)[None], name="ERR"),
-        fits.ImageHDU(np.zeros((1, *data.shape), np.uint32), name="DQ"),
-    ]
-    fits.HDUList(hdus).writeto(path)
-    return str(path)
+    data = data.astype(np.float32)[None]
+    return str(small_calints(path, data, np.sqrt(data), primary=primary, **science))
 
 
 def concatenation(files, **columns):
@@ -111,22 +97,31 @@ def concatenation(files, **columns):
 
 def fake_detection(offset, north):
     """A `Detection` with one candidate and one at twice its S/N."""
+    errors = torch.tensor([1e-6, 1e-6, 1e-2, 2e-2, 3e-2, 4e-2], dtype=torch.float64)
     candidates = replace(
         Candidates.at([offset, (0.5, 0.6)], [1e-5, 2e-5]),
-        covariance=torch.diag(torch.tensor([1e-6, 1e-6, 1e-2, 2e-2, 3e-2, 4e-2])**2).double(),
-        detection_errors=torch.full((2,), 1e-6, dtype=torch.float64),
+        covariance=torch.diag(errors**2), detection_errors=errors[:2],
     )  # fmt: skip
-    curve = Table({"separation": [0.3, 0.5], "small_sample": [1e-4, 1e-5], "contrast": [0.0, 0.0]})
+    curve = QTable({"separation": [0.3, 0.5], "small_sample": [1e-4, 1e-5], "contrast": [0.0, 0.0]})
     curve["separation"].unit = "arcsec"
-    table = candidate_table(
-        candidates, ErrorFactor.constant(2.0), np.zeros((2, 2)), Sky(north, star=(0.5, 0.01))
-    )
-    return SimpleNamespace(candidates=table, contrast_curve=QTable(curve))
+    sky = Sky(north, star=(0.5, 0.01))
+    table = candidate_table(candidates, ErrorFactor.constant(2.0), np.zeros((2, 2)), sky)
+    return SimpleNamespace(candidates=table, contrast_curve=curve)
+
+
+def stub_product(folder, filter):
+    """The image of a concatenation, without light."""
+    header = {"TELESCOP": "JWST", "INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "FILTER": filter,
+              "PUPIL": "MASKRND", "CORONMSK": "MASK335R", "SUBARRAY": "SUB320A335R",
+              "MODE": "ADI", "ANNULI": 1, "SUBSECTS": 1, "KLMODE0": 1}  # fmt: skip
+    product = folder / f"{filter}-KLmodes-all.fits"
+    fits.PrimaryHDU(header=fits.Header(header)).writeto(product, overwrite=True)
+    return product
 
 
 def test_candidates_become_rows_of_spaceklips_table(tmp_path):
     made = fake_detection((-0.3, 0.4), 90.0)
-    table = source_table(made, tmp_path / "x.fits")
+    table = database_files.source_table(made, tmp_path / "x.fits")
     assert list(table["ID"]) == [1, 2]
     # +y points east, and +x north.
     np.testing.assert_allclose(table["RA"][1], 0.4, atol=1e-9)
@@ -143,20 +138,19 @@ def test_candidates_become_rows_of_spaceklips_table(tmp_path):
 def test_products_have_spaceklips_keywords_and_curves(tmp_path):
     table = concatenation([frame(tmp_path / "a_calints.fits", np.ones((SIDE, SIDE)), 63.0)] * 2)
     product = tmp_path / "x-KLmodes-all.fits"
-    fits.PrimaryHDU(
-        np.zeros((1, SIDE, SIDE)), fits.Header({"PSFCENTX": 20.0, "PSFCENTY": 19.5, "KLMODE0": 1})
-    ).writeto(product)
-    complete_header(product, table, "ADI")
+    header = fits.Header({"PSFCENTX": 20.0, "PSFCENTY": 19.5, "KLMODE0": 1})
+    fits.writeto(product, np.zeros((1, SIDE, SIDE)), header)
+    database_files.complete_header(product, table, "ADI")
     header = fits.getheader(product)
     assert (header["NINTS"], header["MODE"], header["ANNULI"]) == (2, "ADI", 1)
     assert (header["CRPIX1"], header["CRPIX2"], header["CRVAL1"]) == (21.0, 20.5, 201.0)
     assert (header["CD1_1"], header["CD2_2"]) == pytest.approx((-PIXEL / 3600, PIXEL / 3600))
     assert "BLURFWHM" not in header
-    write_contrast(product, fake_detection((0.1, 0.1), 0.0))
+    database_files.write_contrast(product, fake_detection((0.1, 0.1), 0.0))
     for name, values in (("seps", [0.3, 0.5]), ("cons", [1e-4, 1e-5]), ("maskcons", [1e-4, 1e-5])):
         saved = np.load(tmp_path / f"x-KLmodes-all_cal_{name}.npy")
         np.testing.assert_array_equal(saved, [values])
-    write_database(tmp_path / "x.dat", table)
+    database_files.write_database(tmp_path / "x.dat", table)
     again = Table.read(tmp_path / "x.dat", format="ascii")
     assert list(again["FITSFILE"]) == list(table["FITSFILE"])
     assert again["ALIGN_SHIFT"][0] == "[[0.0, 0.0]]"
@@ -177,12 +171,7 @@ def test_a_failure_is_reported_after_the_others(tmp_path, monkeypatch, caplog):
     def reduced(key, table, judged, folder, *others):
         if key == "bad":
             raise IncompatibleSetupError("no such filter")
-        header = {name: good[name][0] for name in good.colnames if len(name) <= 8
-                  and name not in ("ALIGN_SHIFT", "BLURFWHM")}  # fmt: skip
-        header |= {"MODE": "ADI", "ANNULI": 1, "SUBSECTS": 1, "KLMODE0": 1}
-        product = folder / "x-KLmodes-all.fits"
-        fits.PrimaryHDU(header=fits.Header(header)).writeto(product)
-        return product, fake_detection((-0.3, 0.4), 0.0)
+        return stub_product(folder, "F444W"), fake_detection((-0.3, 0.4), 0.0)
 
     monkeypatch.setattr(run, "_reduced", reduced)
     with (
@@ -195,12 +184,10 @@ def test_a_failure_is_reported_after_the_others(tmp_path, monkeypatch, caplog):
     assert error.__notes__ == ["concatenation bad"]
     assert "Traceback" in caplog.text
     assert "no such filter" in caplog.text
-    reasons = [str(each.message) for each in skipped]
-    for reason, words in zip(
-        reasons, ("MIR_4QPM", "STAGE1", "no frames of a target", "mask NONE"), strict=True
-    ):
-        assert "is skipped" in reason
-        assert words in reason
+    expected = ("MIR_4QPM", "STAGE1", "no frames of a target", "mask NONE")
+    for reason, words in zip(skipped, expected, strict=True):
+        assert "is skipped" in str(reason.message)
+        assert words in str(reason.message)
     assert list(database.red) == [KEY]
     assert list(database.src[KEY][0]["CON"]) == [2e-5, 1e-5]
     with pytest.raises(ExceptionGroup):
@@ -218,20 +205,11 @@ def test_concatenations_of_one_target_are_searched_together(tmp_path, monkeypatc
         "F300M": searched("F300M", 3, status="MODEL_MISMATCH", header=star),
         "other": searched("F444W", 4, header=other),
     }
-    obs = {
-        key: concatenation(
-            [str(calints(tmp_path / f"{key}_calints.fits"))], FILTER=each.observation.filter
-        )
-        for key, each in made.items()
-    }
+    files = {key: [str(calints(tmp_path / f"{key}_calints.fits"))] for key in made}
+    obs = {k: concatenation(files[k], FILTER=made[k].observation.filter) for k in made}
 
     def reduced(key, table, judged, folder, *others):
-        header = {"TELESCOP": "JWST", "INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "FILTER": key,
-                  "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "SUBARRAY": "SUB320A335R",
-                  "MODE": "ADI", "ANNULI": 1, "SUBSECTS": 1, "KLMODE0": 1}  # fmt: skip
-        product = folder / f"{key}-KLmodes-all.fits"
-        fits.PrimaryHDU(header=fits.Header(header)).writeto(product, overwrite=True)
-        return product, made[key]
+        return stub_product(folder, key), made[key]
 
     monkeypatch.setattr(run, "_reduced", reduced)
     database = StandIn(tmp_path, obs)
@@ -313,23 +291,18 @@ def two_rolls(folder, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["stand-in", "real"])
-def test_a_concatenation_from_frames_to_sources(
-    kind, tmp_path, monkeypatch, request,
-    caplog,
-):  # fmt: skip
-    caplog.set_level(logging.INFO)
+def test_a_concatenation_from_frames_to_sources(kind, tmp_path, monkeypatch, request):
     model, files = two_rolls(tmp_path, monkeypatch)
     sky = np.radians(120.0)
-    database = StandIn(tmp_path, {}) if kind == "stand-in" else request.getfixturevalue(
-        "real_database"
-    )  # fmt: skip
+    real = kind == "real"
+    database = request.getfixturevalue("real_database") if real else StandIn(tmp_path, {})
     database.obs[KEY] = concatenation(files)
     detections = spaceklip.run_obs(
         database, opd=OPD, model=model, systematics="off", fit=ALIGNED, save_rolls=True,
         image="subtracted",
     )  # fmt: skip
     assert list(detections) == list(database.red) == [KEY]
-    (sources,) = database.src[KEY] if kind == "real" else database.src[KEY].values()
+    (sources,) = database.src[KEY] if real else database.src[KEY].values()
     assert len(sources) == 1
     for name, truth in (("RA", 0.8 * np.sin(sky)), ("DEC", 0.8 * np.cos(sky)), ("CON", CONTRAST)):
         assert abs(sources[name][0] - truth) < 4 * sources[f"{name}_ERR"][0]
@@ -355,10 +328,9 @@ def test_a_concatenation_from_frames_to_sources(
 
 def test_a_flux_of_no_filter_is_refused(tmp_path):
     database = StandIn(tmp_path, {KEY: concatenation(["one_calints.fits"])})
-    with pytest.raises(IncompatibleSetupError, match=r"'F335M'.*\['F444W'\]"):
-        spaceklip.run_obs(database, opd=OPD, star_flux={"F335M": 0.4})
-    with pytest.raises(IncompatibleSetupError, match="positive"):
-        spaceklip.run_obs(database, opd=OPD, star_flux={"F444W": -0.4})
+    for flux, words in (({"F335M": 0.4}, r"'F335M'.*\['F444W'\]"), ({"F444W": -0.4}, "positive")):
+        with pytest.raises(IncompatibleSetupError, match=words):
+            spaceklip.run_obs(database, opd=OPD, star_flux=flux)
 
 
 @pytest.mark.slow
@@ -367,20 +339,16 @@ def test_spaceklips_own_subtraction(tmp_path, monkeypatch, real_database):
     pipeline = pytest.importorskip("spaceKLIP.pyklippipeline", exc_type=ImportError)
     model, files = two_rolls(tmp_path, monkeypatch)
     table = concatenation(files)
-    reference = concatenation(
-        [frame(tmp_path / "jw09_calints.fits", fits.getdata(files[0], "SCI")[0], 0.0)]
-    )
+    again = frame(tmp_path / "jw09_calints.fits", fits.getdata(files[0], "SCI")[0], 0.0)
+    reference = concatenation([again])
     reference["TYPE"] = "REF"
     table["ROLL_REF"], reference["ROLL_REF"] = SKY_ANGLES, [0.0]
     real_database.obs[KEY] = vstack([table, reference])
     monkeypatch.setattr(pipeline, "get_transmission", lambda *args: None, raising=False)
     with backend(opd=OPD, model=model, systematics="off", fit=ALIGNED):
-        pipeline.run_obs(
-            real_database,
-            kwargs={"mode": ["ADI+RDI"], "annuli": [1], "subsections": [1], "numbasis": [1],
-                    "algo": "diffrender", "save_rolls": True},
-            subdir="own",
-        )  # fmt: skip
+        modes = {"mode": ["ADI+RDI"], "annuli": [1], "subsections": [1], "numbasis": [1]}
+        options = {**modes, "algo": "diffrender", "save_rolls": True}
+        pipeline.run_obs(real_database, kwargs=options, subdir="own")
     (product,) = (tmp_path / "own").glob("*-KLmodes-all.fits")
     assert fits.getheader(product)["DRALGO"] == "diffrender"
     assert len(list((tmp_path / "own").glob("*_roll*.fits"))) == 2

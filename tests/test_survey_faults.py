@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import pytest
@@ -13,14 +12,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 pytestmark = [pytest.mark.slow, pytest.mark.hard]
 
-WITH_DASK = (
-    "workers_killed", "client_killed", "two_surveys", "out_of_memory", "scheduler_killed",
-    "blind_worker",
-)  # fmt: skip
-
-
+WITH_DASK = ("workers_killed", "client_killed")
+WITHOUT = ("full_disk", "damaged_inputs")
 BY_HAND = (
-    "out_of_memory", "two_surveys", "read_only", "file_limit", "scheduler_killed", "blind_worker",
+    "out_of_memory", "two_surveys", "scheduler_killed", "blind_worker", "read_only", "file_limit",
 )  # fmt: skip
 """Where importing the libraries alone needs more than the limit, the workers of the first are
 restarted without end. The others take long, and break the same code as those that remain."""
@@ -28,14 +23,11 @@ restarted without end. The others take long, and break the same code as those th
 
 @pytest.mark.parametrize(
     "scenario",
-    [
-        pytest.param(name, marks=pytest.mark.study if name in BY_HAND else ())
-        for name in (*WITH_DASK, "read_only", "full_disk", "file_limit", "damaged_inputs")
-    ],
+    [*WITH_DASK, *WITHOUT, *(pytest.param(name, marks=pytest.mark.study) for name in BY_HAND)],
 )
 def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, monkeypatch):
-    if scenario in WITH_DASK and importlib.util.find_spec("distributed") is None:
-        pytest.skip("needs dask.distributed")
+    if scenario in (*WITH_DASK, *BY_HAND[:4]):
+        pytest.importorskip("distributed")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))  # Of the surveys, which are processes.
     try:
         said = getattr(faults, scenario)(tmp_path, 1, 60)
