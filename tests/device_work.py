@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.linear import ResponseCache, field_derivatives, image_derivatives
@@ -19,15 +18,6 @@ from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior
-
-__all__ = [
-    "PLANET", "QUICK", "SIZE", "fit_gradient", "fitted", "frame", "gradient", "image",
-    "model_on", "opd", "parameter_derivatives", "parameter_jacobian", "point_sources", "reached",
-    "response", "rolls",
-    "search", "settings", "tensors",
-]  # fmt: skip
-
-Array = NDArray[np.float64]
 
 NPIX, SIZE = 64, 24
 BASIS = FourierModes(2)
@@ -73,14 +63,9 @@ def rolls():
 
 def settings(**changes):
     """A fit of all parameters, of the wavefront and of the pupil's amplitude."""
-    chosen = {
-        "free": GaussNewton.nircam().free,
-        "basis": BASIS,
-        "prior": WavefrontPrior(amplitude_cycles=1.5, amplitude_scale=1.0),
-        "response_npix": NPIX,
-        **changes,
-    }
-    return GaussNewton(**chosen)
+    prior = WavefrontPrior(amplitude_cycles=1.5, amplitude_scale=1.0)
+    chosen = {"free": GaussNewton.nircam().free, "prior": prior, **changes}
+    return GaussNewton(basis=BASIS, response_npix=NPIX, **chosen)
 
 
 def fitted(device, frames, changes=None, **model):
@@ -160,9 +145,6 @@ def response(device, **changes):
     with torch.no_grad():
         fields = model.fields(start, **values)
     names = ("star_offset", "lyot_shift", "blur")
-    near = responses.near(start, values)
-    slopes = (
-        near.image(fields, values, amplitude_modes=3),
-        responses.parameters(start, values, names, fields),
-    )
-    return [each.cpu().numpy().ravel() for each in slopes]
+    of_modes = responses.near(start, values).image(fields, values, amplitude_modes=3)
+    of_parameters = responses.parameters(start, values, names, fields)
+    return [each.cpu().numpy().ravel() for each in (of_modes, of_parameters)]

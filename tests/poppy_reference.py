@@ -11,10 +11,7 @@ import functools
 import numpy as np
 import poppy
 from astropy import units as u
-from numpy.typing import NDArray
 from scipy.special import j1, jn_zeros
-
-Array = NDArray[np.float64]
 
 DIAMETER = 6.603464
 SIGMA = 3.2927866
