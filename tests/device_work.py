@@ -7,6 +7,7 @@ beyond rounding.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -47,6 +48,7 @@ def tensors(model):
     return model.values(VALUES)
 
 
+@cache
 def frame(k=0, *planets, **details):
     """A star through a drifted wavefront, rolled by 20 degrees a frame."""
     scene = dr.Scene(dr.Star(exposure=200.0), planets=planets)
@@ -91,11 +93,6 @@ def search(device, frames, **model):
         *np.asarray(dr.contrast_curve(fit)["contrast"]),
         float(np.nanstd(detection.subtracted[0])),
     ]
-
-
-def image(device, **changes):
-    model = model_on(device, **changes)
-    return [model(opd(), **tensors(model)).cpu().numpy()]
 
 
 def gradient(device, **changes):

@@ -17,8 +17,6 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-__all__ = ["DEVICE", "Memory", "pretended"]
-
 DEVICE = torch.device("lazy")
 """A device that torch knows by name, and never tries to start."""
 

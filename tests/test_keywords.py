@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import math
 import re
 from pathlib import Path
@@ -18,13 +17,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def written_keywords():
     """Texts of the package's modules that look like keywords of its own."""
-    names = set()
-    for path in (ROOT / "pyklip_diffrender").rglob("*.py"):
-        if path.name == "keywords.py":
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                names |= {node.value} if re.fullmatch(r"DR[A-Z0-9]{2,6}", node.value) else set()
+    modules = (ROOT / "pyklip_diffrender").rglob("*.py")
+    texts = [each.read_text(encoding="utf-8") for each in modules if each.name != "keywords.py"]
+    names = set(re.findall(r"['\"](DR[A-Z0-9]{2,6})['\"]", "\n".join(texts)))
     # The beginning of the names of a position and its error.
     return names - {"DRFM"}
 
@@ -55,8 +50,7 @@ def test_values_are_such_as_headers_can_hold():
 
 
 @pytest.mark.parametrize(
-    ("unit", "text"),
-    [("MJy/sr", "MJy/sr"), ("MJy sr-1", "MJy/sr"), ("electron / s", "electron / s"), ("", "")],
+    ("unit", "text"), [("MJy sr-1", "MJy/sr"), ("electron / s", "electron / s"), ("", "")]
 )
 def test_units_are_spelled_as_the_pipeline_does(unit, text):
     assert fits_unit(u.Unit(unit)) == text

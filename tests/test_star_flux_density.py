@@ -46,8 +46,7 @@ def as_calspec(path):
         fits.Column("WAVELENGTH", "D", "ANGSTROMS", array=GRID.to_value(u.AA)),
         fits.Column("FLUX", "D", "FLAM", array=flam.value),
     ]
-    table = fits.BinTableHDU.from_columns(columns)
-    fits.HDUList([fits.PrimaryHDU(), table]).writeto(path / "star.fits")
+    fits.BinTableHDU.from_columns(columns).writeto(path / "star.fits")
     return path / "star.fits"
 
 
@@ -61,31 +60,33 @@ def as_photometry(path):
 
 
 @pytest.mark.parametrize("write", [as_text, as_ecsv, as_calspec, as_photometry])
-@pytest.mark.parametrize("filter", ["F200W", "F356W", "F444W"])
+@pytest.mark.parametrize("filter", ["F200W", "F444W"])
 def test_power_law_in_every_format(tmp_path, write, filter):
     flux = dr.star_flux_density(write(tmp_path), filter)
     # The package interpolates power laws exactly; what remains are the two quadratures.
     assert flux.to_value(u.Jy) == pytest.approx(expected(filter), rel=1e-4)
 
 
-def test_files_that_do_not_say_the_flux(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"missing\.txt: no such file"):
-        dr.star_flux_density(tmp_path / "missing.txt", "F444W")
+@pytest.mark.parametrize(
+    ("text", "expected", "complaint"),
+    [
+        ("<html>no</html>", CorruptFileError, "wavelength in micron and flux density in Jy"),
+        ("3.0 -1\n4.0 nan\n5.0 0.5\n", CorruptFileError, "1 of 3 samples"),
+        (
+            "0.5 1.0\n1.5 0.5\n2.2 0.3\n",
+            IncompatibleSetupError, r"covers 0\.500 to 2\.200 micron",
+        ),
+        (
+            "1.0 1.0\n2.0 0.5\n8.0 0.3\n",
+            IncompatibleSetupError, r"no sample between 2\.00 and 8\.00 micron",
+        ),
+    ],
+)  # fmt: skip
+def test_files_that_do_not_say_the_flux(tmp_path, text, expected, complaint):
     path = tmp_path / "star.txt"
-    path.write_text("<html>not found</html>")
-    with pytest.raises(CorruptFileError, match="wavelength in micron and flux density in Jy"):
+    path.write_text(text)
+    with pytest.raises(expected, match=complaint):
         dr.star_flux_density(path, "F444W")
-    path.write_text("3.0 -1\n4.0 nan\n5.0 0.5\n")
-    with pytest.raises(CorruptFileError, match="1 of 3 samples"):
-        dr.star_flux_density(path, "F444W")
-    path.write_text("0.5 1.0\n1.5 0.5\n2.2 0.3\n")
-    with pytest.raises(IncompatibleSetupError, match=r"covers 0\.500 to 2\.200 micron"):
-        dr.star_flux_density(path, "F444W")
-    path.write_text("1.0 1.0\n2.0 0.5\n8.0 0.3\n")
-    with pytest.raises(IncompatibleSetupError, match=r"no sample between 2\.00 and 8\.00 micron"):
-        dr.star_flux_density(path, "F444W")
-    with pytest.raises(IncompatibleSetupError, match="F999W"):
-        dr.star_flux_density(as_text(tmp_path), "F999W")
 
 
 def test_spectral_type():
@@ -101,15 +102,21 @@ def test_spectral_type():
     assert dr.star_flux_density("M4V,K=5", "F356W").value == bright
     # Between K5 and M5 the table has no W1 - W2; it has to increase from one to the other.
     ratio = [
-        dr.star_flux_density(f"{each}, K=5", "F460M")
-        / dr.star_flux_density(f"{each}, K=5", "F356W")
-        for each in ("K5V", "M0V", "M2.5V", "M5V")
+        dr.star_flux_density(star, "F460M") / dr.star_flux_density(star, "F356W")
+        for star in ("K5V, K=5", "M0V, K=5", "M2.5V, K=5", "M5V, K=5")
     ]
     assert np.all(np.diff(ratio) > 0)
 
 
-def test_spectral_types_that_are_not_known(tmp_path):
-    with pytest.raises(IncompatibleSetupError, match="got type B2, expected B5 to M9"):
-        dr.star_flux_density("B2V, K=5", "F444W")
-    with pytest.raises(FileNotFoundError, match=r'such as "A2V, K=6\.77"'):
-        dr.star_flux_density("K0III, K=5", "F444W")
+@pytest.mark.parametrize(
+    ("star", "filter", "expected", "complaint"),
+    [
+        ("B2V, K=5", "F444W", IncompatibleSetupError, "got type B2, expected B5 to M9"),
+        ("K0III, K=5", "F444W", FileNotFoundError, r'such as "A2V, K=6\.77"'),
+        ("missing.txt", "F444W", FileNotFoundError, r"missing\.txt: no such file"),
+        ("A0V, K=0", "F999W", IncompatibleSetupError, "F999W"),
+    ],
+)
+def test_stars_that_are_not_known(star, filter, expected, complaint):
+    with pytest.raises(expected, match=complaint):
+        dr.star_flux_density(star, filter)

@@ -95,7 +95,7 @@ def _optics() -> list[Breakage]:
         Breakage(
             "array-turn", "a turned array shows the turned pupil",
             "((a + b, -1), (c + d, -2))", "((a + b, -2), (c + d, -1))",
-            "orientation bridges_poppy",
+            "bridges_poppy",
         ),
     ]  # fmt: skip
 
