@@ -39,13 +39,7 @@ LENIENT = (
 
 
 def lower_bounds():
-    """Lower bound of each requirement that a user of the package has, tools aside.
-
-    Raises
-    ------
-    ValueError
-        If a requirement has none.
-    """
+    """Lower bound of each requirement that a user of the package has; tools have none."""
     bounds = {}
     for requirement in [*PROJECT["dependencies"], *(each for n in EXTRAS for each in OPTIONAL[n])]:
         found = re.match(r"([\w.-]+)(?:\[\w+\])?\s*>=\s*([\w.]+)", requirement)

@@ -65,10 +65,14 @@ def lyot_stop(npix):
     return polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy()
 
 
+def _write(path, primary, *hdus):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fits.HDUList([primary, *hdus]).writeto(path)
+
+
 def _image(path, data, npix, **keywords):
     header = fits.Header({**keywords, "PUPLSCAL": JWST_DIAMETER / npix, "PUPLDIAM": JWST_DIAMETER})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fits.PrimaryHDU(data, header).writeto(path)
+    _write(path, fits.PrimaryHDU(data, header))
 
 
 def _zernike_table(path, seed):
@@ -94,18 +98,15 @@ def _field_dependence(path, seed):
         "MINXFIE": -3.0, "MAXXFIE": 3.0, "MINYFIE": -3.0, "MAXYFIE": 3.0,
         "V2SIGN": -1.0, "V2ORIGIN": 0.0, "V3SIGN": 1.0, "V3ORIGIN": -7.8,
     }  # fmt: skip
-    hdus = fits.HDUList([fits.PrimaryHDU(header=fits.Header(keywords))])
-    for _ in range(2):
-        values = rng.normal(scale=2, size=(15, 78)) / np.sqrt(1 + np.arange(78))
-        hdus.append(fits.BinTableHDU(Table(values, names=[f"Z{k}" for k in range(1, 79)])))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    hdus.writeto(path)
+    tables = rng.normal(scale=2, size=(2, 15, 78)) / np.sqrt(1 + np.arange(78))
+    names = [f"Z{k}" for k in range(1, 79)]
+    hdus = [fits.BinTableHDU(Table(values, names=names)) for values in tables]
+    _write(path, fits.PrimaryHDU(header=fits.Header(keywords)), *hdus)
 
 
 def _kernels(path, kernel):
-    path.parent.mkdir(parents=True, exist_ok=True)
     cubes = [fits.ImageHDU(kernel[None], name=sensor) for sensor in SENSORS]
-    fits.HDUList([fits.PrimaryHDU(), *cubes]).writeto(path)
+    _write(path, fits.PrimaryHDU(), *cubes)
 
 
 def _filter(path, name):
@@ -117,27 +118,23 @@ def _filter(path, name):
     columns = {"WAVELENGTH": wavelength * 1e10, "THROUGHPUT": throughput}
     table = fits.BinTableHDU(Table(columns))
     table.header["WAVEUNIT"] = "Angstrom"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fits.HDUList([fits.PrimaryHDU(), table]).writeto(path)
+    _write(path, fits.PrimaryHDU(), table)
 
 
 def wss_file(path, seed=5, date="2022-08-11T02:00:00"):
     """A wavefront-sensing product as MAST has it: 256 x 256, microns, 0 where there is none."""
     opd = lopsided(256, seed, 0.07) * pupil(256)
-    primary = fits.PrimaryHDU(
-        header=fits.Header({"APERNAME": "NRCA3_FP1", "DATE-OBS": date[:10], "TIME-OBS": date[11:]})
-    )
-    hdus = [primary, fits.ImageHDU(opd.astype(np.float32), name="RESULT_PHASE")]
-    hdus.append(fits.ImageHDU(np.zeros((4, 4), np.float32), name="EXPECTED_PHASE"))
-    fits.HDUList(hdus).writeto(path)
+    cards = {"APERNAME": "NRCA3_FP1", "DATE-OBS": date[:10], "TIME-OBS": date[11:]}
+    images = {"RESULT_PHASE": opd.astype(np.float32), "EXPECTED_PHASE": np.zeros((4, 4), "f4")}
+    hdus = [fits.ImageHDU(data, name=name) for name, data in images.items()]
+    _write(path, fits.PrimaryHDU(header=fits.Header(cards)), *hdus)
 
 
 def make_stpsf_data(folder, npix=256):
     """Write the directory, for STPSF_PATH, with `npix` samples across the pupil."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "version.txt").write_text("2.1.0\n", encoding="utf-8")
     nircam = folder / "NIRCam"
-    nircam.mkdir()
+    nircam.mkdir(parents=True)
+    (folder / "version.txt").write_text("2.1.0\n", encoding="utf-8")
     rows = "".join(f"{name}\t9\n" for name in FILTERS)
     (nircam / "filters.tsv").write_text(f"filter\tnlambda\n{rows}", encoding="utf-8")
     name = f"RevW_npix{npix}.fits.gz"
@@ -153,9 +150,8 @@ def make_stpsf_data(folder, npix=256):
         _zernike_table(folder / file, 10 + number)
     _field_dependence(nircam / "OPD" / "field_dep_table_nircam.fits", 20)
     phase = lopsided(1024, 30, 40e-9).astype(np.float32)
-    for field_point in ("fp1", "fp6"):
-        path = nircam / "OPD" / f"wss_target_phase_{field_point}.fits"
-        _image(path, phase, 1024, BUNIT="m")
+    for point in ("fp1", "fp6"):
+        _image(nircam / "OPD" / f"wss_target_phase_{point}.fits", phase, 1024, BUNIT="m")
     _kernels(nircam / "IPC" / "KERNEL_IPC_CUBE.fits", IPC)
     _kernels(nircam / "IPC" / "KERNEL_PPC_CUBE.fits", PPC)
     for filter_name in FILTERS:

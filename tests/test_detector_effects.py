@@ -53,7 +53,7 @@ def test_resampling_is_that_of_scipy(image, rng):
     rows = rng.uniform(-2, SHAPE[0] + 1, size=(17, 19))
     columns = rng.uniform(-2, SHAPE[1] + 1, size=(17, 19))
     rows[0, :3], columns[0, :3] = (0, SHAPE[0] - 1, 5), (0, SHAPE[1] - 1, 7)
-    axes = tuple(np.arange(n) for n in SHAPE)
+    axes = tuple(map(np.arange, SHAPE))
     function = RegularGridInterpolator(axes, image, bounds_error=False, fill_value=0)
     found = apply(LinearResampling(rows, columns, SHAPE), image)
     assert np.abs(found - function((rows, columns))).max() < 1e-14

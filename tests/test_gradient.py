@@ -162,36 +162,11 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy():
     assert (coarse - expected).norm() > 0.1 * expected.norm()
 
 
-@pytest.mark.parametrize("wrong", [0, 3])
-def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong):
-    """Of that many directions the preconditioner says far too little; two more iterations end."""
-    rng = np.random.default_rng(8)
-    vectors = torch.from_numpy(np.linalg.qr(rng.normal(size=(20, 20)))[0])
-    powers = torch.logspace(0, 6, 20, dtype=torch.float64)
-    stated = powers.clone()
-    stated[:wrong] /= 10.0 ** (2 + torch.arange(wrong))
-    products = []
-
-    def product(x):
-        products.append(x)
-        return vectors @ (powers * (vectors.T @ x))
-
-    def precondition(x):
-        return vectors @ ((vectors.T @ x) / stated)
-
-    gradient, ends = torch.from_numpy(rng.normal(size=20)), {"enough": 1e-8, "sufficient": 0.0}
-    x, settled = conjugate_gradients(product, precondition, gradient, **ends)
-    expected = vectors @ ((vectors.T @ gradient) / powers)
-    assert settled
-    torch.testing.assert_close(x, expected, rtol=1e-6, atol=1e-8)
-    assert len(products) <= wrong + 2
-
-
 def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner():
     """And end without a step where there is nothing to gain."""
     rng = np.random.default_rng(9)
-    matrix = torch.from_numpy(rng.normal(size=(30, 30)))
-    matrix = matrix @ matrix.T
+    root = torch.from_numpy(rng.normal(size=(30, 30)))
+    matrix = root @ root.T
     gradient = torch.from_numpy(rng.normal(size=30))
     x, settled = conjugate_gradients(lambda x: matrix @ x, lambda x: 1e6 * x, gradient)
     assert not settled

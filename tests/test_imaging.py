@@ -15,8 +15,7 @@ from pyklip_diffrender.imaging import SkyModel
 from pyklip_diffrender.imaging.sky_model import _BEAM, _STRENGTH, interpolation_matrix
 
 SIZE, NPIX, CONTRAST = 24, 64, 4e-7
-PLACE = (0.45, 0.3)
-"""x, y arcsec of a planet from the star in the first frame."""
+PLACE = (0.45, 0.3)  # x, y arcsec of a planet from the star in the first frame.
 
 
 @cache
@@ -102,9 +101,9 @@ def test_a_source_in_white_noise_keeps_its_peak():
     beam = np.fft.fftshift(np.fft.ifft2(model._beam).real)
     seen = convolve2d(kept, beam, mode="same", boundary="wrap")
     assert seen[model.center, model.center] == pytest.approx(1.0, rel=1e-9)
-    # Standard deviation of the beam along x.
-    width = np.sqrt((beam * places[:, 1].reshape(beam.shape) ** 2).sum() / beam.sum())
-    fwhm = width * np.sqrt(8 * np.log(2)) * model.pixelscale
+    # Variance of the beam along x.
+    variance = (beam * places[:, 1].reshape(beam.shape) ** 2).sum() / beam.sum()
+    fwhm = np.sqrt(8 * np.log(2) * variance) * model.pixelscale
     assert fwhm == pytest.approx(_BEAM * model.resolution, rel=0.02)
 
 

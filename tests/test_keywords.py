@@ -15,18 +15,14 @@ from pyklip_diffrender.io.headers import KEYWORDS, fits_unit, set_keyword
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def written_keywords():
-    """Texts of the package's modules that look like keywords of its own."""
+def test_every_keyword_that_is_written_is_declared():
+    """By texts of the package's modules that look like keywords of its own."""
     modules = (ROOT / "pyklip_diffrender").rglob("*.py")
     texts = [each.read_text(encoding="utf-8") for each in modules if each.name != "keywords.py"]
-    names = set(re.findall(r"['\"](DR[A-Z0-9]{2,6})['\"]", "\n".join(texts)))
-    # The beginning of the names of a position and its error.
-    return names - {"DRFM"}
-
-
-def test_every_keyword_that_is_written_is_declared():
+    written = set(re.findall(r"['\"](DR[A-Z0-9]{2,6})['\"]", "\n".join(texts)))
+    # The names of a position and its error are formed from their beginning.
     formed = {f"DRFM{axis}{end}" for axis in ("RA", "DE") for end in ("", "ER")}
-    assert written_keywords() | formed == set(KEYWORDS)
+    assert written - {"DRFM"} | formed == set(KEYWORDS)
 
 
 def test_keywords_fit_on_cards():

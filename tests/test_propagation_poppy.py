@@ -17,9 +17,7 @@ from pyklip_diffrender.optics import PupilGrid, polygon_coverage
 NPIX = 128
 WAVELENGTH = 4.5e-6
 # Off both axes and off the diagonals; all but one need ``--full``.
-SEPARATIONS = (
-    0.6, *(pytest.param(r, marks=pytest.mark.slow) for r in (0.0, 0.05, 2.3))
-)  # fmt: skip
+SEPARATIONS = (0.6, pytest.param(2.3, marks=pytest.mark.slow))
 ANGLE = 0.7
 
 
@@ -67,16 +65,6 @@ def test_the_default_sampling_has_converged(separation):
         model = ours(route=route)
         image = model(reference.lopsided_opd(NPIX), star_offset=star(separation)).numpy()
         assert error(image, finest) <= 1e-7
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize(("sampling", "separation"), [(2, 0.6), (4, 0.0)])
-def test_the_same_samples_give_the_same_image(sampling, separation):
-    """poppy's cells and ours are the same lattice: only rounding is left, whatever it is worth."""
-    model = ours(sampling, route="planes")
-    image = model(reference.lopsided_opd(NPIX), star_offset=star(separation)).numpy()
-    truth = theirs(sampling, separation)
-    assert np.linalg.norm(image - truth) <= 1e-12 * np.linalg.norm(truth)
 
 
 @pytest.mark.hard

@@ -9,9 +9,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pyklip_diffrender.instrument import jwst_pupil, nircam_coronagraph
+from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.io import ARCSEC
-from pyklip_diffrender.optics import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.wavefront import random_opd
 
 WAVELENGTH = 4.5e-6
@@ -78,13 +78,9 @@ def test_blur_and_binning_keep_the_light(ny, nx, oversample, sigma, seed):
     detector = system(48, ny, nx, oversample).detector
     generator = torch.Generator().manual_seed(seed)
     samples = torch.rand(oversample * ny, oversample * nx, generator=generator).double()
-    blur = {"blur": torch.tensor([sigma], dtype=torch.float64)}
-    image = detector.image(samples, blur)
+    image = detector.image(samples, {"blur": torch.tensor([sigma], dtype=torch.float64)})
     assert image.shape == (ny, nx)
     assert float(image.sum()) == pytest.approx(float(samples.sum()), rel=1e-10)
-    # No blur adds contrast to what it is applied to. (Binning afterwards may: it aliases.)
-    blurred = system(48, oversample * ny, oversample * nx).detector.image(samples, blur)
-    assert float(blurred.std()) <= float(samples.std()) * (1 + ROUNDING)
 
 
 @given(npix=SAMPLES, ny=SIDES, nx=SIDES, more=st.tuples(st.integers(0, 4), st.integers(0, 4)),
@@ -107,14 +103,3 @@ def test_a_tilted_wavefront_is_a_star_off_the_axis(npix, ny, nx, offset, seed):
     torch.testing.assert_close(
         model(opd + ARCSEC * tilt), model(opd, offset), rtol=1e-8, atol=1e-15
     )
-
-
-@pytest.mark.parametrize("npix", [2, 7, 39])
-def test_pupils_of_any_size_have_the_same_area(npix):
-    """To the pixels in which a strut crosses the edge of a segment: 1.7e-4, the most, at 39."""
-    cover = jwst_pupil(npix)
-    assert cover.shape == (npix, npix)
-    assert 0 <= float(cover.min()) <= float(cover.max()) <= 1
-    area = float(cover.sum()) * (JWST_DIAMETER / npix) ** 2
-    reference = float(jwst_pupil(1).sum()) * JWST_DIAMETER**2
-    assert area == pytest.approx(reference, rel=2e-4)

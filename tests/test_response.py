@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from device_work import parameter_jacobian
-from finite_differences import difference
+from derivatives import difference, parameter_jacobian
 from scipy.stats import multivariate_normal
 
 from pyklip_diffrender.errors import ShapeError
@@ -99,11 +98,9 @@ def test_wavefront_response_takes_the_field_of_the_star_it_is_asked_about():
     here = response.image(model.fields(OPD, **VALUES), VALUES)
     chosen = [29, 41, 57, 90, 110]
     expected = slopes(model, moved, chosen)
-    error, old_error = (
-        float((image[chosen] - expected).norm() / expected.norm()) for image in (there, here)
-    )
+    error, old_error = (float((a[chosen] - expected).norm()) for a in (there, here))
     # The field's derivative turns with the pupil's phase, by little: the image's does more.
-    assert error < 0.025
+    assert error < 0.025 * float(expected.norm())
     assert error < 0.6 * old_error
     fields = [2 * field for field in model.fields(OPD, **VALUES)]
     torch.testing.assert_close(response.image(fields, VALUES), 2 * here, rtol=1e-6, atol=0)
@@ -115,17 +112,14 @@ def test_responses_that_are_not_stored_are_the_same():
     start = downsample(OPD, 64)
     basis = FourierModes(3)
     fields = model.fields(start, **VALUES)
-    images = {}
+    every = []
     for memory in (math.inf, 8 * len(basis) * 20 * 24, 100.0):
         responses = ResponseCache(model, basis, npix=64, keep=2, memory=memory)
-        near, far = (
-            responses.near(shifted, VALUES)
-            for shifted in (start, start + 2e-7 * model.entrance.lit)
-        )
+        places = (start, start + 2e-7 * model.entrance.lit)
+        near, far = (responses.near(opd, VALUES) for opd in places)
         assert responses.near(start, VALUES) is near
         assert (near.stored, far.stored) == (memory == math.inf, memory > 1000)
-        images[memory] = [each.image(fields, VALUES, 5) for each in (near, far)]
-    every = list(images.values())
+        every.append([each.image(fields, VALUES, 5) for each in (near, far)])
     for others in every[1:]:
         for image, expected in zip(others, every[0], strict=True):
             assert float((image - expected).norm() / expected.norm()) < 1e-6
@@ -209,9 +203,9 @@ def test_copies_of_the_star_do_not_touch_the_mask(filter_name, mask, size, npix)
 
 def test_derivatives_behind_a_bar_are_as_exact_as_behind_a_round_mask():
     """They need the bar near the field only, a quarter of its length."""
-    model = nircam_coronagraph("F210M", image_mask="MASKSWB", npix=256, fov_pixels=32, nlambda=2)
+    model = nircam_coronagraph("F210M", image_mask="MASKSWB", npix=256, fov_pixels=32, nlambda=1)
     opd = torch.from_numpy(random_opd(3, npix=256, rms=60e-9).data)
-    coarse, exact = (WavefrontResponse(model, FourierModes(6), opd, {}, npix=n) for n in (128, 256))
+    coarse, exact = (WavefrontResponse(model, FourierModes(4), opd, {}, npix=n) for n in (128, 256))
     assert exact.coarse is model
     assert coarse.coarse.recipe["bar_reach"] == pytest.approx(2.5, abs=0.01)
     fields = model.fields(opd)
@@ -300,13 +294,11 @@ def test_what_no_wavefront_explains_ends_at_the_ceiling():
     problem = {"design": design, "observed": observed, "shape": one, "group": group}
     got = solved({**problem, "fixed": nothing}, one[:1], 5)
     assert float(got.scales[0]) == 100.0
-    assert got.variance is not None
     assert bool(torch.isfinite(got.step).all() and torch.isfinite(got.variance).all())
 
 
 def test_the_prior_falls_with_frequency():
-    prior = WavefrontPrior(knee=3.0, slope=2.0)
-    shape = prior.shape(BASIS)
+    shape = WavefrontPrior(knee=3.0, slope=2.0).shape(BASIS)
     assert (shape[:54] == 1).all()
     at_three = (BASIS.frequencies == 3.0) & (BASIS.group_index == 1)
     assert at_three.any()
@@ -324,11 +316,8 @@ def test_a_prior_is_learnt_from_maps():
     grid = PupilGrid.full(128)
     mirror = (jwst_pupil(128) > 0).numpy()
     generator = torch.Generator().manual_seed(3)
-    steps = [
-        basis.opd(torch.randn(len(basis), dtype=torch.float64, generator=generator) * deviation,
-                  grid).numpy() * 1e-9 * mirror
-        for _ in range(12)
-    ]  # fmt: skip
+    drawn = torch.randn(12, len(basis), dtype=torch.float64, generator=generator) * deviation
+    steps = [basis.opd(each, grid).numpy() * 1e-9 * mirror for each in drawn]
     maps = np.cumsum([np.zeros((128, 128)), *steps], axis=0)
     found = learn_prior(maps, basis)
     # Segment motions and low Fourier modes look alike: what one has, the other may take.

@@ -126,8 +126,7 @@ def test_frames_of_module_b_have_its_model(tmp_path):
         del frame.header[key]
     # The archive's name of the file names the detector, CORONMSK the module.
     assert model_for(frame, SIZE) is model
-    named = replace(frame, name="a frame")
-    assert model_for(named, SIZE) is model
+    assert model_for(replace(frame, name="a frame"), SIZE) is model
 
 
 def test_what_is_not_modelled_is_refused(tmp_path):

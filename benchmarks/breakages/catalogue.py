@@ -123,7 +123,7 @@ def _instrument_and_wavefront() -> list[Breakage]:
         Breakage(
             "quadrature", "condensed wavelengths keep the integrals of polynomials",
             "nodes.tolist()), tuple((vectors[0] ** 2).tolist()))\n\n    @property",
-            "nodes.tolist()), tuple(abs(vectors[0]).tolist()))\n\n    @property", "bandpass",
+            "nodes.tolist()), tuple(abs(vectors[0]).tolist()))\n\n    @property", "optics",
         ),
         Breakage(
             "drift-size", "random drifts grow with the hours",

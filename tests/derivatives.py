@@ -1,8 +1,10 @@
-"""Slopes by automatic differentiation, and by differences that share no code with it."""
+"""Derivatives by automatic differentiation, and by differences that share no code with it."""
 
 from __future__ import annotations
 
 import torch
+
+from pyklip_diffrender.linear import field_derivatives, image_derivatives
 
 
 @torch.no_grad()
@@ -18,3 +20,10 @@ def slopes(function, at, direction, step):
     (gradient,) = torch.autograd.grad(function(variable), variable)
     found = float((gradient * direction).sum())
     return found, float(difference(function, at, direction, step))
+
+
+def parameter_jacobian(model, opd, values, names, fields=None):
+    """Derivatives of the image, (components, ny, nx); the fields may be those of a finer model."""
+    slopes = field_derivatives(model, opd, values, names)
+    fields = model.fields(opd, **values) if fields is None else fields
+    return image_derivatives(model, fields, values, names, slopes)
