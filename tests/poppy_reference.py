@@ -11,10 +11,7 @@ import functools
 import numpy as np
 import poppy
 from astropy import units as u
-from numpy.typing import NDArray
 from scipy.special import j1, jn_zeros
-
-Array = NDArray[np.float64]
 
 DIAMETER = 6.603464
 SIGMA = 3.2927866
@@ -43,12 +40,8 @@ def array_optic(name, amplitude, opd=None):
 def coronagraph(pupil, opd, lyot, internal_opd, *, oversample, fov_pixels, pixelscale):
     """Entrance pupil, inversion, occulter, Lyot stop, internal aberration, detector.
 
-    Parameters
-    ----------
-    pupil, opd, lyot, internal_opd : ndarray, (npix, npix)
-        Amplitudes and OPDs in m, all in the entrance-pupil orientation.
-    oversample : int
-        Of the FFT: samples per lambda/D in the plane of the occulter.
+    Amplitudes and OPDs (npix, npix), m, have the entrance-pupil orientation; `oversample` is the
+    number of samples per lambda/D in the plane of the occulter.
     """
     system = poppy.OpticalSystem(oversample=oversample, npix=len(pupil), verbose=False)
     system.pupil_diameter = DIAMETER * u.m

@@ -17,8 +17,6 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-__all__ = ["DEVICE", "Memory", "pretended"]
-
 DEVICE = torch.device("lazy")
 """A device that torch knows by name, and never tries to start."""
 
@@ -37,19 +35,17 @@ class Memory:
     """Knows which memory belongs to the device."""
 
     def __init__(self):
-        self._held: set[StorageWeakRef] = set()
-        self._anywhere: set[StorageWeakRef] = set()
+        self._places = {}
 
     def holds(self, tensor):
         """Whether a tensor is on the device; None for a constant that goes with both devices."""
-        key = self._key(tensor)
-        return None if key in self._anywhere else key in self._held
+        return self._places.get(self._key(tensor), False)
 
     def mark(self, tensor, held):
         """State where a tensor is."""
-        key = self._key(tensor)
-        for keys, state in ((self._held, True), (self._anywhere, None)):
-            (keys.add if held is state else keys.discard)(key)
+        self._places.pop(self._key(tensor), None)
+        if held is not False:
+            self._places[self._key(tensor)] = held
 
     @staticmethod
     def _key(tensor):

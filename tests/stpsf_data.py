@@ -8,12 +8,13 @@ Lyot stop lacks one opening, the pupil has an extra obstruction.
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 
 import numpy as np
+import pytest
 import torch
 from astropy.io import fits
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from pyklip_diffrender.instrument import (
     filter_throughput,
@@ -22,8 +23,6 @@ from pyklip_diffrender.instrument import (
     maskrnd_openings,
 )
 from pyklip_diffrender.optics import JWST_DIAMETER, PupilGrid, polygon_coverage
-
-Array = NDArray[np.float64]
 
 FILTERS = ("F200W", "F335M", "F444W")
 SENSORS = [str(number) for number in range(481, 491)]
@@ -36,11 +35,10 @@ def lopsided(npix, seed, rms):
     """A smooth map of the given rms over the square, m: low-order waves of random phase."""
     rng = np.random.default_rng(seed)
     axis = (np.arange(npix) - (npix - 1) / 2) / npix
-    total = np.zeros((npix, npix))
-    for _ in range(24):
-        fx, fy = rng.normal(scale=2.5, size=2)
-        phase = 2 * np.pi * (fx * axis[None, :] + fy * axis[:, None] + rng.uniform())
-        total += rng.normal() * np.cos(phase)
+    waves = [(*rng.normal(scale=2.5, size=2), rng.uniform(), rng.normal()) for _ in range(24)]
+    fx, fy, shift, size = np.array(waves).T[:, :, None]
+    in_x, in_y = (np.exp(2j * np.pi * each) for each in (fx * axis, fy * axis + shift))
+    total = ((size * in_y).T @ in_x).real
     return rms * (total - total.mean()) / total.std()
 
 
@@ -67,10 +65,14 @@ def lyot_stop(npix):
     return polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy()
 
 
+def _write(path, primary, *hdus):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fits.HDUList([primary, *hdus]).writeto(path)
+
+
 def _image(path, data, npix, **keywords):
     header = fits.Header({**keywords, "PUPLSCAL": JWST_DIAMETER / npix, "PUPLDIAM": JWST_DIAMETER})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fits.PrimaryHDU(data, header).writeto(path)
+    _write(path, fits.PrimaryHDU(data, header))
 
 
 def _zernike_table(path, seed):
@@ -80,9 +82,8 @@ def _zernike_table(path, seed):
     for module, (left, right) in corners.items():
         for channel in ("LW", "SW"):
             base = rng.normal(scale=15e-9, size=36) / np.sqrt(1 + np.arange(36) / 4)
-            for number, (v2, v3) in enumerate(
-                (a, b) for a in np.linspace(left, right, 3) for b in (-9.5, -8.1, -6.1)
-            ):
+            points = product(np.linspace(left, right, 3), (-9.5, -8.1, -6.1))
+            for number, (v2, v3) in enumerate(points):
                 values = base + rng.normal(scale=2e-9, size=36)
                 rows.append((f"NIRCam{channel}{module}", f"P{number}", v2, v3, *values))
     names = ["instrument", "field_point_name", "V2", "V3", *(f"Zernike_{k}" for k in range(1, 37))]
@@ -92,35 +93,20 @@ def _zernike_table(path, seed):
 def _field_dependence(path, seed):
     rng = np.random.default_rng(seed)
     keywords = {
-        "INSTR": "NIRCam",
-        "WFBASIS": "Noll Zernikes",
-        "FIEBASIS": "Legendre Polynomials",
-        "NCOEFWF": 78,
-        "NCOEFFIE": 15,
-        "FIEORDER": 4,
-        "FANGUNIT": "arcmin",
-        "OPDUNIT": "nm",
-        "MINXFIE": -3.0,
-        "MAXXFIE": 3.0,
-        "MINYFIE": -3.0,
-        "MAXYFIE": 3.0,
-        "V2SIGN": -1.0,
-        "V2ORIGIN": 0.0,
-        "V3SIGN": 1.0,
-        "V3ORIGIN": -7.8,
-    }
-    hdus = fits.HDUList([fits.PrimaryHDU(header=fits.Header(keywords))])
-    for _ in range(2):
-        values = rng.normal(scale=2, size=(15, 78)) / np.sqrt(1 + np.arange(78))
-        hdus.append(fits.BinTableHDU(Table(values, names=[f"Z{k}" for k in range(1, 79)])))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    hdus.writeto(path)
+        "INSTR": "NIRCam", "WFBASIS": "Noll Zernikes", "FIEBASIS": "Legendre Polynomials",
+        "NCOEFWF": 78, "NCOEFFIE": 15, "FIEORDER": 4, "FANGUNIT": "arcmin", "OPDUNIT": "nm",
+        "MINXFIE": -3.0, "MAXXFIE": 3.0, "MINYFIE": -3.0, "MAXYFIE": 3.0,
+        "V2SIGN": -1.0, "V2ORIGIN": 0.0, "V3SIGN": 1.0, "V3ORIGIN": -7.8,
+    }  # fmt: skip
+    tables = rng.normal(scale=2, size=(2, 15, 78)) / np.sqrt(1 + np.arange(78))
+    names = [f"Z{k}" for k in range(1, 79)]
+    hdus = [fits.BinTableHDU(Table(values, names=names)) for values in tables]
+    _write(path, fits.PrimaryHDU(header=fits.Header(keywords)), *hdus)
 
 
 def _kernels(path, kernel):
-    path.parent.mkdir(parents=True, exist_ok=True)
     cubes = [fits.ImageHDU(kernel[None], name=sensor) for sensor in SENSORS]
-    fits.HDUList([fits.PrimaryHDU(), *cubes]).writeto(path)
+    _write(path, fits.PrimaryHDU(), *cubes)
 
 
 def _filter(path, name):
@@ -129,52 +115,32 @@ def _filter(path, name):
         throughput[[0, -1]] = 0
     else:
         wavelength, throughput = filter_throughput(name)
-    table = fits.BinTableHDU(
-        Table([wavelength * 1e10, throughput], names=["WAVELENGTH", "THROUGHPUT"])
-    )
+    columns = {"WAVELENGTH": wavelength * 1e10, "THROUGHPUT": throughput}
+    table = fits.BinTableHDU(Table(columns))
     table.header["WAVEUNIT"] = "Angstrom"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fits.HDUList([fits.PrimaryHDU(), table]).writeto(path)
+    _write(path, fits.PrimaryHDU(), table)
 
 
 def wss_file(path, seed=5, date="2022-08-11T02:00:00"):
     """A wavefront-sensing product as MAST has it: 256 x 256, microns, 0 where there is none."""
     opd = lopsided(256, seed, 0.07) * pupil(256)
-    primary = fits.PrimaryHDU(
-        header=fits.Header({"APERNAME": "NRCA3_FP1", "DATE-OBS": date[:10], "TIME-OBS": date[11:]})
-    )
-    hdus = [primary, fits.ImageHDU(opd.astype(np.float32), name="RESULT_PHASE")]
-    hdus.append(fits.ImageHDU(np.zeros((4, 4), np.float32), name="EXPECTED_PHASE"))
-    fits.HDUList(hdus).writeto(path)
+    cards = {"APERNAME": "NRCA3_FP1", "DATE-OBS": date[:10], "TIME-OBS": date[11:]}
+    images = {"RESULT_PHASE": opd.astype(np.float32), "EXPECTED_PHASE": np.zeros((4, 4), "f4")}
+    hdus = [fits.ImageHDU(data, name=name) for name, data in images.items()]
+    _write(path, fits.PrimaryHDU(header=fits.Header(cards)), *hdus)
 
 
 def make_stpsf_data(folder, npix=256):
-    """Write the directory.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-    npix : int
-        Samples across the pupil; stpsf's own files have 1024.
-
-    Returns
-    -------
-    Path
-        `folder`, for STPSF_PATH.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "version.txt").write_text("2.1.0\n", encoding="utf-8")
+    """Write the directory, for STPSF_PATH, with `npix` samples across the pupil."""
     nircam = folder / "NIRCam"
-    nircam.mkdir()
-    (nircam / "filters.tsv").write_text(
-        "filter\tnlambda\n" + "".join(f"{name}\t9\n" for name in FILTERS), encoding="utf-8"
-    )
+    nircam.mkdir(parents=True)
+    (folder / "version.txt").write_text("2.1.0\n", encoding="utf-8")
+    rows = "".join(f"{name}\t9\n" for name in FILTERS)
+    (nircam / "filters.tsv").write_text(f"filter\tnlambda\n{rows}", encoding="utf-8")
     name = f"RevW_npix{npix}.fits.gz"
     _image(folder / f"jwst_pupil_{name}", pupil(npix).astype(np.uint8), npix)
-    _image(
-        folder / f"JWpupil_segments_{name}", segments(npix).astype(np.uint8), npix, VERSION="RevW"
-    )
+    labels = segments(npix).astype(np.uint8)
+    _image(folder / f"JWpupil_segments_{name}", labels, npix, VERSION="RevW")
     opd = (lopsided(npix, 1, 66e-9) * pupil(npix)).astype(np.float32)
     _image(folder / "JWST_OTE_OPD_cycle1_example_2022-07-30.fits", opd, npix, BUNIT="m")
     _image(nircam / "optics" / "NIRCam_Lyot_Somb.fits.gz", lyot_stop(npix), npix)
@@ -183,14 +149,37 @@ def make_stpsf_data(folder, npix=256):
     for number, file in enumerate(("si_zernikes_coron_wfe.fits", "si_zernikes_isim_cv3.fits")):
         _zernike_table(folder / file, 10 + number)
     _field_dependence(nircam / "OPD" / "field_dep_table_nircam.fits", 20)
-    for field_point in ("fp1", "fp6"):
-        phase = lopsided(1024, 30, 40e-9).astype(np.float32)
-        path = nircam / "OPD" / f"wss_target_phase_{field_point}.fits"
-        _image(path, phase, 1024, BUNIT="m")
+    phase = lopsided(1024, 30, 40e-9).astype(np.float32)
+    for point in ("fp1", "fp6"):
+        _image(nircam / "OPD" / f"wss_target_phase_{point}.fits", phase, 1024, BUNIT="m")
     _kernels(nircam / "IPC" / "KERNEL_IPC_CUBE.fits", IPC)
     _kernels(nircam / "IPC" / "KERNEL_PPC_CUBE.fits", PPC)
     for filter_name in FILTERS:
         _filter(nircam / "filters" / f"{filter_name}_throughput.fits", filter_name)
+    return folder
+
+
+def nircam(folder, image_mask="MASK335R", pupil_mask="MASKRND", band="F444W", npix=256,
+           pupil="RevW", aperture=None, **options):  # fmt: skip
+    """A configured stpsf.NIRCam."""
+    import stpsf
+
+    instrument = stpsf.NIRCam()
+    instrument.filter = band
+    instrument.image_mask, instrument.pupil_mask = image_mask, pupil_mask
+    if aperture is not None:
+        # stpsf takes the detector from the mask; the other channel sees the mask as well.
+        instrument.set_position_from_aperture_name(aperture)
+    instrument.pupil = str(folder / f"jwst_pupil_{pupil}_npix{npix}.fits.gz")
+    instrument.options.update(options)
+    return instrument
+
+
+def official_files(shared_data):
+    """The folder of STScI's own files."""
+    folder = shared_data / "stpsf-data"
+    if not folder.is_dir():
+        pytest.skip(f"needs STScI's files for stpsf in {folder}")
     return folder
 
 

@@ -32,32 +32,28 @@ def apply(effect, image):
     return effect(torch.from_numpy(image)).numpy()
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.124, 0.126, 0.4, 1.15, 3.0, 12.0])
+@pytest.mark.parametrize("sigma", [0.124, 0.126, 1.15, 12.0])
 def test_blur_is_that_of_scipy(image, sigma):
     truth = scipy.ndimage.gaussian_filter(image, sigma)
     assert np.abs(apply(GaussianBlur(sigma), image) - truth).max() < 1e-13
     assert np.array_equal(truth, image) == (sigma < 0.125)
 
 
-@pytest.mark.parametrize("angle", [0.0776, -0.5, 12.3, 90.0, 200.0])
+@pytest.mark.parametrize("angle", [0.0776, -0.5, 200.0])
 def test_rotation_is_that_of_scipy(image, angle):
     truth = scipy.ndimage.rotate(image, angle, reshape=False)
-    assert np.abs(apply(SplineRotation(angle, SHAPE), image) - truth).max() < 1e-12
-
-
-def test_rotation_takes_complex_fields(image):
-    rotation = SplineRotation(7.0, SHAPE)
-    field = torch.from_numpy(image + 1j * image[::-1])
-    parts = torch.complex(rotation(field.real.contiguous()), rotation(field.imag.contiguous()))
-    assert torch.allclose(rotation(field), parts, atol=1e-14)
-    assert rotation(field.to(torch.complex64)).dtype == torch.complex64
+    rotation = SplineRotation(angle, SHAPE)
+    assert np.abs(apply(rotation, image) - truth).max() < 1e-12
+    twice = apply(rotation, image + 2j * image)
+    assert np.abs(twice - (1 + 2j) * truth).max() < 1e-12
+    assert rotation(torch.from_numpy(image + 0j).to(torch.complex64)).dtype == torch.complex64
 
 
 def test_resampling_is_that_of_scipy(image, rng):
     rows = rng.uniform(-2, SHAPE[0] + 1, size=(17, 19))
     columns = rng.uniform(-2, SHAPE[1] + 1, size=(17, 19))
     rows[0, :3], columns[0, :3] = (0, SHAPE[0] - 1, 5), (0, SHAPE[1] - 1, 7)
-    axes = tuple(np.arange(n) for n in SHAPE)
+    axes = tuple(map(np.arange, SHAPE))
     function = RegularGridInterpolator(axes, image, bounds_error=False, fill_value=0)
     found = apply(LinearResampling(rows, columns, SHAPE), image)
     assert np.abs(found - function((rows, columns))).max() < 1e-14
@@ -68,34 +64,28 @@ def test_resampling_is_that_of_scipy(image, rng):
 def test_crosstalk_is_that_of_astropy(image):
     truth = convolve(image, KERNEL, boundary="fill", fill_value=0)
     assert np.abs(apply(PixelCrosstalk(KERNEL), image) - truth).max() < 1e-14
-    # What the kernel has to the right of its middle goes to the right.
-    point = np.zeros(SHAPE)
-    point[10, 10] = 1
-    assert np.allclose(apply(PixelCrosstalk(KERNEL), point)[9:12, 9:12], KERNEL / KERNEL.sum())
     with pytest.raises(ShapeError, match="two odd lengths"):
         PixelCrosstalk(np.ones((2, 3)))
 
 
-def effects():
-    y, x = np.mgrid[:9, :11] * 0.93
-    return {
-        "blur": GaussianBlur(0.7),
-        "rotation": SplineRotation(3.0, (9, 11)),
-        "resampling": LinearResampling(y + 0.21, x + 0.33, (9, 11)),
-        "crosstalk": PixelCrosstalk(KERNEL),
-    }
+Y, X = np.mgrid[:9, :11] * 0.93
+EFFECTS = {
+    "blur": GaussianBlur(0.7),
+    "rotation": SplineRotation(3.0, (9, 11)),
+    "resampling": LinearResampling(Y + 0.21, X + 0.33, (9, 11)),
+    "crosstalk": PixelCrosstalk(KERNEL),
+}
 
 
-@pytest.mark.parametrize("name", effects())
+@pytest.mark.parametrize("name", EFFECTS)
 def test_adjoints(name):
     """<A u, v> = <u, A* v>, where autograd gives A*."""
-    effect, generator = effects()[name], torch.manual_seed(3)
-    u = torch.randn(9, 11, dtype=torch.float64, generator=generator).requires_grad_()
-    v = torch.randn(9, 11, dtype=torch.float64, generator=generator)
+    effect, generator = EFFECTS[name], torch.manual_seed(3)
+    u, v = torch.randn(2, 9, 11, dtype=torch.float64, generator=generator)
+    u.requires_grad_()
     image = effect(u)
     (back,) = torch.autograd.grad(image, u, v)
-    left, right = (image * v).sum(), (u * back).sum()
-    assert abs(left - right) < 1e-12 * image.norm() * v.norm()
+    assert abs((image * v).sum() - (u * back).sum()) < 1e-12 * image.norm() * v.norm()
     assert torch.allclose(effect(torch.stack([u, 2 * u]))[1], 2 * image, atol=1e-14)
 
 
@@ -106,10 +96,9 @@ def test_the_width_of_the_blur_can_be_fitted():
 
 
 def test_a_chain_bins_between_samples_and_pixels(rng):
-    shape, oversample = (6, 8), 3
     fine = rng.uniform(size=(18, 24))
     blur, crosstalk = GaussianBlur(1.3), PixelCrosstalk(KERNEL)
-    common = {"shape": shape, "pixelscale": (0.06, 0.06), "oversample": oversample,
+    common = {"shape": (6, 8), "pixelscale": (0.06, 0.06), "oversample": 3,
               "dtype": torch.float64, "device": torch.device("cpu")}  # fmt: skip
     chain = ChainDetector(**common, on_samples=(blur,), on_pixels=(crosstalk,))
     binned = apply(blur, fine).reshape(6, 3, 8, 3).sum(axis=(1, 3))

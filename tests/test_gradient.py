@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ FREE = ("star_offset", "lyot_shift", "lyot_rotation", "blur", "flux", "backgroun
 SCALES = {"segment": 20.0, "texture": 20.0}
 
 
+@cache
 def solver_of(frames, **changes):
     """A solver and a state away from the solution, for frames in three wavelengths.
 
@@ -40,27 +42,21 @@ def solver_of(frames, **changes):
     problems = []
     for _ in range(frames):
         data = 1e9 * model(opd.data).numpy() * (1 + 0.1 * rng.normal(size=(SIZE, SIZE)))
-        observation = dr.Observation.from_arrays(
-            data, np.sqrt(np.abs(data)) + 40.0, pixelscale=model.detector.pixelscale
-        )
-        observation = replace(observation, first_pixel=(600, 1600))
-        problems.append(Problem(model, observation, opd, systematics=pattern))
-    settings = GaussNewton(
-        free=FREE,
-        basis=BASIS,
-        # Far coarser than the model, in one of its three wavelengths.
-        response_npix=32,
-        response_wavelengths=1,
-        prior=WavefrontPrior(SCALES, fit_scales=False, amplitude_cycles=2.0, amplitude_scale=2.0),
-        **changes,
-    )
+        error = np.sqrt(np.abs(data)) + 40.0
+        seen = dr.Observation.from_arrays(data, error, pixelscale=model.detector.pixelscale)
+        seen = replace(seen, first_pixel=(600, 1600))
+        problems.append(Problem(model, seen, opd, systematics=pattern))
+    # The copy is far coarser than the model, in one of its three wavelengths.
+    coarse = {"response_npix": 32, "response_wavelengths": 1}
+    prior = WavefrontPrior(SCALES, fit_scales=False, amplitude_cycles=2.0, amplitude_scale=2.0)
+    settings = GaussNewton(free=FREE, basis=BASIS, prior=prior, **coarse, **changes)
     solver = Solver(problems, settings, BASIS, progress=False)
     priors = solver.priors_of(settings)
     unknowns = solver.first_unknowns(priors)
     vector = unknowns.initial()
     deviation = solver.prior_deviation(unknowns, priors)
-    moved = torch.from_numpy(rng.normal(size=len(vector)))
     moves = torch.where(torch.isfinite(deviation), deviation, 0.0).clamp(max=5.0)
+    moved = torch.from_numpy(rng.normal(size=len(vector)))
     return solver, solver.objective.at(unknowns, vector + 0.1 * moves * moved)
 
 
@@ -75,12 +71,11 @@ def gradient(solver, state, *, exact):
 
 def slope_along(solver, state, direction, step=1e-4):
     """Minus half the derivative of chi-squared along a direction, by differences."""
-    weights = solver.objective.errors(state, 0.01, 4.0)
+    objective = solver.objective
+    weights = objective.errors(state, 0.01, 4.0)
     ahead, behind = (
-        solver.objective.chi2(
-            solver.objective.at(state.unknowns, state.vector + sign * step * direction), weights
-        )
-        for sign in (1, -1)
+        objective.chi2(objective.at(state.unknowns, state.vector + each * direction), weights)
+        for each in (step, -step)
     )
     return -(ahead - behind) / (4 * step)
 
@@ -102,10 +97,7 @@ def slopes_by_name(solver, state):
         yield name, direction, slope_along(solver, state, direction)
 
 
-FRAMES = pytest.mark.parametrize("frames", [pytest.param(1, marks=pytest.mark.slow), 2])
-
-
-@FRAMES
+@pytest.mark.parametrize("frames", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_gradient_is_that_of_chi_squared(frames):
     """Against differences of chi-squared, which have an error of 1e-7 of it in these steps."""
     solver, state = solver_of(frames)
@@ -120,19 +112,20 @@ def test_the_gradient_is_that_of_chi_squared(frames):
 
 def of_the_model_itself(solver):
     """A solver whose coarse copy is the model."""
-    return Solver(
-        [forward.problem for forward in solver.objective.forwards],
-        replace(solver.settings, response_npix=NPIX, response_wavelengths=3),
-        BASIS,
-        progress=False,
-    )
+    settings = replace(solver.settings, response_npix=NPIX, response_wavelengths=3)
+    problems = [forward.problem for forward in solver.objective.forwards]
+    return Solver(problems, settings, BASIS, progress=False)
 
 
 @pytest.mark.parametrize("contrast", [3e-4, 0.05])
-def test_the_gradient_by_companions_is_that_of_chi_squared(contrast):
-    """Their images are those of the coarse copy, which is the model in this test."""
-    solver, state = solver_of(2)
-    solver = of_the_model_itself(solver)
+def test_the_gradient_with_a_companion_is_that_of_chi_squared(contrast):
+    """Their images are those of the coarse copy, which is the model in this test.
+
+    The light of a bright one, which outshines the star, depends on all unknowns. Neglected, the
+    gradient would be wrong by more than its size.
+    """
+    coarse, state = solver_of(2)
+    solver = of_the_model_itself(coarse)
     companion = dr.Planet(contrast, 0.4, 20.0)
     state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
     exact = gradient(solver, state, exact=True)
@@ -142,76 +135,38 @@ def test_the_gradient_by_companions_is_that_of_chi_squared(contrast):
         moved[place] = 1.0
         slope = slope_along(solver, state, moved, step)
         np.testing.assert_allclose(float(exact[place]), slope, rtol=1e-3)
-
-
-@FRAMES
-def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames):
-    """It outshines the star. Neglected, the gradient would be wrong by more than its size."""
-    solver, state = solver_of(frames)
-    solver = of_the_model_itself(solver)
-    companion = dr.Planet(0.05, 0.5, 20.0)
-    state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
-    assert (state.points[0].total - state.points[0].star).sum() > state.points[0].light.sum()
-    exact, copied = (gradient(solver, state, exact=value) for value in (True, False))
+    if contrast < 0.01:
+        return
+    point, copied = state.points[0], gradient(solver, state, exact=False)
+    assert (point.total - point.star).sum() > point.light.sum()
     for name, direction, slope in slopes_by_name(solver, state):
         for each in (exact, copied):
             np.testing.assert_allclose(float(each @ direction), slope, rtol=2e-3, err_msg=name)
 
 
-@FRAMES
-def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames):
+def test_the_curvature_is_that_of_the_model_whatever_the_copy():
     """Against the equations of a copy that is the model; those of a coarse one are far from it."""
-    solver, state = solver_of(frames)
-    assert solver.objective.shares_pattern == (frames > 1,) * frames
-    same = of_the_model_itself(solver)
+    solver, state = solver_of(2)
     rng = np.random.default_rng(6)
     unit = units(solver, state)
     step = 0.01 * unit * torch.from_numpy(rng.normal(size=len(unit)))
     curved, products = [], []
-    for each in (solver, same):
+    for each in (solver, of_the_model_itself(solver)):
         weights = each.objective.errors(state, 0.01, 4.0)
         equations = linearise(each.objective, state, 0.01, len(BASIS), 4.0)
         curved.append(unit * ModelDerivatives(each.objective, state, weights).product(step))
         products.append(unit * (equations.curvature @ step))
-    expected = products[1]
+    coarse, expected = products
     assert (curved[0] - expected).norm() < 2e-3 * expected.norm()
     assert (curved[1] - expected).norm() < 2e-3 * expected.norm()
-    assert (products[0] - expected).norm() > 0.1 * expected.norm()
-
-
-@pytest.mark.parametrize("wrong", [0, 1, 3])
-def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong):
-    """Of that many directions the preconditioner says far too little; two more iterations end."""
-    rng = np.random.default_rng(8)
-    vectors = torch.from_numpy(np.linalg.qr(rng.normal(size=(20, 20)))[0])
-    powers = torch.logspace(0, 6, 20, dtype=torch.float64)
-    stated = powers.clone()
-    stated[:wrong] /= 10.0 ** (2 + torch.arange(wrong))
-    products = []
-
-    def product(x):
-        products.append(x)
-        return vectors @ (powers * (vectors.T @ x))
-
-    gradient = torch.from_numpy(rng.normal(size=20))
-    x, settled = conjugate_gradients(
-        product,
-        lambda x: vectors @ ((vectors.T @ x) / stated),
-        gradient,
-        enough=1e-8,
-        sufficient=0.0,
-    )
-    expected = vectors @ ((vectors.T @ gradient) / powers)
-    assert settled
-    torch.testing.assert_close(x, expected, rtol=1e-6, atol=1e-8)
-    assert len(products) <= wrong + 2
+    assert (coarse - expected).norm() > 0.1 * expected.norm()
 
 
 def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner():
     """And end without a step where there is nothing to gain."""
     rng = np.random.default_rng(9)
-    matrix = torch.from_numpy(rng.normal(size=(30, 30)))
-    matrix = matrix @ matrix.T
+    root = torch.from_numpy(rng.normal(size=(30, 30)))
+    matrix = root @ root.T
     gradient = torch.from_numpy(rng.normal(size=30))
     x, settled = conjugate_gradients(lambda x: matrix @ x, lambda x: 1e6 * x, gradient)
     assert not settled
@@ -237,7 +192,5 @@ def test_a_step_depends_on_its_arguments_alone(accurate):
     assert again.carried.needs_accurate == once.carried.needs_accurate
     assert first == StepState(first.priors, damping=0.3, kappa=0.1)
     # What is handed on counts.
-    assert not torch.equal(
-        solver.step(state, replace(first, damping=30.0), 0.02, len(BASIS)).state.vector,
-        once.state.vector,
-    )
+    damped = solver.step(state, replace(first, damping=30.0), 0.02, len(BASIS))
+    assert not torch.equal(damped.state.vector, once.state.vector)

@@ -15,31 +15,23 @@ from pyklip_diffrender.imaging import SkyModel
 from pyklip_diffrender.imaging.sky_model import _BEAM, _STRENGTH, interpolation_matrix
 
 SIZE, NPIX, CONTRAST = 24, 64, 4e-7
-PLACE = (0.45, 0.3)
-"""x, y arcsec of a planet from the star in the first frame."""
-
-
-@cache
-def fit():
-    """Two rolls of a star with a faint planet, fitted without it."""
-    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
-    opd = dr.random_opd(1, npix=NPIX)
-    frames = []
-    for k, angle in enumerate((0.0, 30.0)):
-        turn = np.radians(angle)
-        # On the detector, the sky turns clockwise as the position angle of +y grows.
-        x, y = np.array(PLACE) @ np.array([[np.cos(turn), -np.sin(turn)],
-                                           [np.sin(turn), np.cos(turn)]])  # fmt: skip
-        scene = dr.Scene(planets=(dr.Planet.from_offset(CONTRAST, float(x), float(y)),))
-        shot = dr.simulate(model, scene, opd, seed=k)
-        frames.append(replace(shot, position_angles=np.full(len(shot), angle)))
-    settings = dr.GaussNewton(cycles=3, max_companions=0)
-    return dr.refine(model, frames, opd, settings=settings)
+PLACE = (0.45, 0.3)  # x, y arcsec of a planet from the star in the first frame.
 
 
 @cache
 def sky():
-    return SkyModel([fit()])
+    """Of two rolls of a star with a faint planet, fitted without it."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
+    opd = dr.random_opd(1, npix=NPIX)
+    frames = []
+    for k, angle in enumerate((0.0, 30.0)):
+        # On the detector, the sky turns clockwise as the position angle of +y grows.
+        planet = dr.Planet.from_offset(CONTRAST, *PLACE).rotated(-angle)
+        shot = dr.simulate(model, dr.Scene(planets=(planet,)), opd, seed=k)
+        frames.append(replace(shot, position_angles=np.full(len(shot), angle)))
+    return SkyModel(
+        [dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=3, max_companions=0))]
+    )
 
 
 def convolution(kernel, ny, nx):
@@ -49,8 +41,10 @@ def convolution(kernel, ny, nx):
     return np.array(columns).T
 
 
-def dense(model):
-    """Posterior mean of the peaks of point sources, as a matrix that multiplies the data."""
+@cache
+def dense():
+    """Images of point sources in the data, and the posterior mean of their peaks, as matrices."""
+    model = sky()
     linear, _ = model.groups[0]
     ny, nx = linear.frames[0].residual.shape
     n = ny * nx
@@ -58,39 +52,29 @@ def dense(model):
     h = np.concatenate([seen @ model._onto_frames[0][k].toarray() for k in (0, 1)])
     inverse = np.zeros((2 * n, 2 * n))
     for k in (0, 1):
-        unit = torch.eye(n, dtype=torch.float64).reshape(n, ny, nx)
-        cleaned = linear.clean({k: unit})
+        cleaned = linear.clean({k: torch.eye(n, dtype=torch.float64).reshape(n, ny, nx)})
         for j in (0, 1):
             part = (linear.frames[j].weight * cleaned[j]).flatten(1).numpy()
             inverse[j * n : (j + 1) * n, k * n : (k + 1) * n] = part.T
-    prior = model._prior.ravel() ** 2
-    weighted = prior[:, None] * (h.T @ inverse)
-    return np.linalg.solve(np.eye(len(prior)) + weighted @ h, weighted)
+    weighted = model._prior.reshape(-1, 1) ** 2 * (h.T @ inverse)
+    return h, np.linalg.solve(np.eye(len(weighted)) + weighted @ h, weighted)
 
 
 def test_the_estimate_is_that_of_the_closed_form():
     model = sky()
     data = np.concatenate([model.light()[0][k][0].numpy().ravel() for k in (0, 1)])
-    sources = (dense(model) @ data).reshape(model.shape)
+    sources = (dense()[1] @ data).reshape(model.shape)
     expected = np.fft.ifft2(np.fft.fft2(sources) * model._beam).real
-    estimate = model.estimate()[0]
     # Conjugate gradients end at a residual of a thousandth, in other units.
-    np.testing.assert_allclose(estimate, expected, atol=4e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(model.estimate()[0], expected, atol=4e-3 * np.abs(expected).max())
 
 
 def test_the_error_is_that_of_the_closed_form():
     model = sky()
-    linear, _ = model.groups[0]
-    ny, nx = linear.frames[0].residual.shape
-    h = np.concatenate(
-        [convolution(model._point_sources[0], ny, nx) @ model._onto_frames[0][k].toarray()
-         for k in (0, 1)]
-    )  # fmt: skip
     # The estimate's covariance is E Sigma E^T; with E = S H^T Sigma^-1 that is E H S^T.
-    estimate = dense(model)
+    h, estimate = dense()
     response = estimate @ h
-    prior = model._prior.ravel() ** 2
-    covariance = (response * prior) @ (np.eye(len(prior)) - response).T
+    covariance = (response * model._prior.ravel() ** 2) @ (np.eye(len(response)) - response).T
     beam = np.fft.fftshift(np.fft.ifft2(model._beam).real)
     places = np.indices(model.shape).reshape(2, -1).T - model.center
     seen = np.array([np.roll(beam, place, (0, 1)).ravel() for place in places])
@@ -99,8 +83,7 @@ def test_the_error_is_that_of_the_closed_form():
     error = model.error()
     for ring in range(1, 6):
         chosen = distance.astype(int) == ring
-        expected = np.median(exact[chosen])
-        assert np.median(error[chosen]) == pytest.approx(expected, rel=0.12)
+        assert np.median(error[chosen]) == pytest.approx(np.median(exact[chosen]), rel=0.12)
 
 
 def test_a_source_in_white_noise_keeps_its_peak():
@@ -118,9 +101,9 @@ def test_a_source_in_white_noise_keeps_its_peak():
     beam = np.fft.fftshift(np.fft.ifft2(model._beam).real)
     seen = convolve2d(kept, beam, mode="same", boundary="wrap")
     assert seen[model.center, model.center] == pytest.approx(1.0, rel=1e-9)
-    # Standard deviation of the beam along x.
-    width = np.sqrt((beam * places[:, 1].reshape(beam.shape) ** 2).sum() / beam.sum())
-    fwhm = width * np.sqrt(8 * np.log(2)) * model.pixelscale
+    # Variance of the beam along x.
+    variance = (beam * places[:, 1].reshape(beam.shape) ** 2).sum() / beam.sum()
+    fwhm = np.sqrt(8 * np.log(2) * variance) * model.pixelscale
     assert fwhm == pytest.approx(_BEAM * model.resolution, rel=0.02)
 
 
@@ -136,9 +119,8 @@ def test_a_source_has_the_stated_throughput():
     # The first frame has north up.
     brightest = np.unravel_index(added.argmax(), added.shape)
     np.testing.assert_allclose(model.grid[brightest], place[0], atol=model.pixelscale)
-    peak = float(light[0][0, row, column])
-    kept = float((interpolation_matrix(model.places(place.numpy(), 0.0), model.shape)
-                  @ added.ravel())[0]) / peak  # fmt: skip
+    onto = interpolation_matrix(model.places(place.numpy(), 0.0), model.shape)
+    kept = float((onto @ added.ravel())[0]) / float(light[0][0, row, column])
     # The beam is right for white noise and on the average of a ring; one place may have more.
     assert 0.3 < kept < 1.3
     stated = model.throughput()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import scipy.ndimage
 import torch
 from astropy.io import fits
 from astropy.table import Table
+from stpsf_data import official_files
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import (
@@ -23,7 +25,6 @@ from pyklip_diffrender.instrument import (
     is_short_wave,
     nircam_coronagraph,
 )
-from pyklip_diffrender.linear import jacobian
 from pyklip_diffrender.wavefront import random_opd
 
 SMALL = {"npix": 128, "fov_pixels": 24}
@@ -36,20 +37,12 @@ def opd():
 
 @pytest.mark.parametrize(
     ("mask", "filter_name"),
-    [
-        ("MASK210R", "F210M"),
-        ("MASK335R", "F335M"),
-        ("MASK430R", "F430M"),
-        ("MASK430R", "f444w"),
-        ("MASK335R", "F210M"),
-        ("MASK430R", "F200W"),
-        ("MASK210R", "F444W"),
-    ],
+    [("MASK335R", "F335M"), ("MASK430R", "f444w"), ("MASK335R", "F210M"), ("MASK210R", "F444W")],
 )
 def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(mask, filter_name, opd):
     """Where half of a planet's light passes the mask, and beyond it, where all does."""
-    model = nircam_coronagraph(filter_name, image_mask=mask, nlambda=3, **SMALL)
-    clear = nircam_coronagraph(filter_name, image_mask=None, nlambda=3, **SMALL)
+    model = nircam_coronagraph(filter_name, image_mask=mask, nlambda=2, **SMALL)
+    clear = nircam_coronagraph(filter_name, image_mask=None, nlambda=2, **SMALL)
     assert model.planes[0].name == mask
     scale = detector_place(mask, filter_name).pixelscale
     assert model.detector.pixelscale == (scale, scale)
@@ -96,15 +89,24 @@ def test_places_on_the_detector_count_from_zero():
     assert filter_shift("f444w") == (0.177, -0.205)
 
 
-def test_places_that_are_not_known_are_refused_with_those_that_are():
-    with pytest.raises(IncompatibleSetupError, match=r"'MASKA335R'.*MASK335R"):
-        detector_place("MASKA335R", "F444W")
-    with pytest.raises(IncompatibleSetupError, match=r"'F150W'.*F182M.*F480M"):
-        detector_place("MASK335R", "F150W")
-    with pytest.raises(IncompatibleSetupError, match=r"F182M.*F480M, not for 'F277W'"):
-        filter_shift("F277W")
-    with pytest.raises(IncompatibleSetupError, match=r"'b', expected 'A' or 'B'"):
-        detector_place("MASK335R", "F444W", module="b")
+REFUSED = {
+    r"'MASKA335R'.*MASK335R": partial(detector_place, "MASKA335R", "F444W"),
+    r"'F150W'.*F182M.*F480M": partial(detector_place, "MASK335R", "F150W"),
+    "'b', expected 'A' or 'B'": partial(detector_place, "MASK335R", "F444W", module="b"),
+    r"F182M.*F480M, not for 'F277W'": partial(filter_shift, "F277W"),
+    r"NRCA5.*F210M.*NRCA2; use crosstalk=False": partial(
+        nircam_coronagraph, "F210M", image_mask="MASK210R", crosstalk=True
+    ),
+    r"NRCA5.*F444W.*NRCB5; use crosstalk=False": partial(
+        nircam_coronagraph, "F444W", module="B", crosstalk=True
+    ),
+}
+
+
+@pytest.mark.parametrize("complaint", REFUSED)
+def test_what_is_not_known_is_refused_with_what_is(complaint):
+    with pytest.raises(IncompatibleSetupError, match=complaint):
+        REFUSED[complaint]()
 
 
 @pytest.mark.parametrize("mask", MASKS)
@@ -124,57 +126,28 @@ PPC = [[0, 0, 0], [0, 0.99877, 0.00123], [0, 0, 0]]
 
 def coupled(image):
     """The kernels of NRCA5 as scipy convolves with them, zero beyond the edges."""
-    array = image.numpy()
     for kernel in (IPC, PPC):
-        array = scipy.ndimage.convolve(array, np.array(kernel) / np.sum(kernel), mode="constant")
-    return array
+        image = scipy.ndimage.convolve(image, np.array(kernel) / np.sum(kernel), mode="constant")
+    return image
 
 
-@pytest.mark.parametrize("values", [{}, {"blur": 0.026}, {"blur": 0.026, "star_offset": (0.4, 0)}])
+@pytest.mark.parametrize("values", [{}, {"blur": 0.026, "star_offset": (0.4, 0)}])
 @pytest.mark.parametrize("oversample", [1, 2])
 def test_crosstalk_couples_pixels_after_everything_else(values, oversample, opd):
-    def system(**changes):
-        return nircam_coronagraph(nlambda=2, oversample=oversample, **SMALL, **changes)
-
-    plain, model = system()(opd, **values), system(crosstalk=True)(opd, **values)
+    settings = {"nlambda": 1, "oversample": oversample, **SMALL}
+    plain, model = (
+        nircam_coronagraph(**settings, crosstalk=each)(opd, **values).numpy()
+        for each in (False, True)
+    )
     truth = coupled(plain)
     # The kernels above are rounded to 4 digits.
-    assert np.abs(model.numpy() - truth).max() < 2e-6 * truth.max()
-    assert np.abs(plain.numpy() - truth).max() > 5e-3 * truth.max()
-
-
-def test_what_the_right_neighbour_gets_is_on_the_right(opd):
-    detector = nircam_coronagraph(nlambda=1, crosstalk=True, **SMALL).detector
-    point = torch.zeros(24, 24, dtype=torch.float64)
-    point[10, 12] = 1
-    image = detector.image(point, {})
-    assert float(image[10, 13] - image[10, 11]) == pytest.approx(0.00123 * 0.9746, rel=0.02)
-    assert float(image[11, 12] - image[9, 12]) == pytest.approx(0, abs=1e-15)
-    assert float(image.sum()) == pytest.approx(1, abs=1e-12)
-
-
-def test_blur_can_be_fitted_with_crosstalk(opd):
-    model = nircam_coronagraph(nlambda=1, crosstalk=True, **SMALL)
-    model(opd)
-    width = torch.tensor([0.02], dtype=torch.float64)
-    (slope,) = jacobian(lambda w: [model(opd, blur=w)], width)[0]
-    change = (model(opd, blur=width + 1e-5) - model(opd, blur=width - 1e-5)) / 2e-5
-    torch.testing.assert_close(slope, change, rtol=1e-6, atol=1e-9 * float(change.abs().max()))
-
-
-def test_crosstalk_of_another_detector_is_refused():
-    with pytest.raises(IncompatibleSetupError, match=r"NRCA5.*F210M.*NRCA2; use crosstalk=False"):
-        nircam_coronagraph("F210M", image_mask="MASK210R", crosstalk=True)
-    with pytest.raises(IncompatibleSetupError, match=r"NRCA5.*F444W.*NRCB5; use crosstalk=False"):
-        nircam_coronagraph("F444W", module="B", crosstalk=True)
+    assert np.abs(model - truth).max() < 2e-6 * truth.max()
+    assert np.abs(plain - truth).max() > 5e-3 * truth.max()
 
 
 @pytest.fixture(scope="module")
 def official(shared_data):
-    folder = shared_data / "stpsf-data"
-    if not folder.is_dir():
-        pytest.skip(f"needs STScI's files for stpsf in {folder}")
-    return folder
+    return official_files(shared_data)
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -183,11 +156,9 @@ def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official
     truth = data["THROUGHPUT"] / data["THROUGHPUT"].max()
     wavelength, throughput = filter_throughput(name)
     # The ends are where the table, in units of 0.1 Angstrom, has been rounded.
-    inside = (
-        np.abs(data["WAVELENGTH"] * 1e-10 - (wavelength[0] + wavelength[-1]) / 2)
-        <= np.ptp(wavelength) / 2 + 1e-11
-    )
-    mine = np.interp(data["WAVELENGTH"] * 1e-10, wavelength, throughput) * inside
+    where = data["WAVELENGTH"] * 1e-10
+    inside = (where >= wavelength[0] - 1e-11) & (where <= wavelength[-1] + 1e-11)
+    mine = np.interp(where, wavelength, throughput) * inside
     assert np.abs(mine - truth).max() <= 0.002
     assert mine.sum() == pytest.approx(truth.sum(), rel=2e-3)
 
@@ -195,13 +166,10 @@ def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official
 @pytest.mark.parametrize("module", ["A", "B"])
 def test_aberrations_are_those_of_the_official_field_points(official, module):
     table = Table.read(official / "si_zernikes_coron_wfe.fits")
+    places = [(r["instrument"].strip(), r["field_point_name"].strip()) for r in table]
     for short_wave, mask in itertools.product((True, False), MASKS):
-        channel, point = f"NIRCam{'SW' if short_wave else 'LW'}{module}", f"Z{mask[4:]}_{module}"
-        (row,) = (
-            r
-            for r in table
-            if r["instrument"].strip() == channel and r["field_point_name"].strip() == point
-        )
+        channel = f"NIRCam{'SW' if short_wave else 'LW'}{module}"
+        row = table[places.index((channel, f"Z{mask[4:]}_{module}"))]
         truth = np.array([row[f"Zernike_{k}"] for k in range(1, 37)])
         mine = internal_wavefront_error(mask, short_wave=short_wave, module=module)
         np.testing.assert_allclose(mine, truth, rtol=1e-3, atol=1e-18)
@@ -222,9 +190,8 @@ def test_pixels_and_places_are_those_of_the_siaf(mask, filter_name, module):
     along = "" if place.place == "-" else f"_{place.place}"
     siaf, full = pysiaf.Siaf("NIRCam"), "_FULL" if module == "A" else ""
     aperture = siaf[f"{place.detector}{full}_{mask}{along}"]
-    assert place.siaf_pixelscale == pytest.approx(
-        (aperture.XSciScale, aperture.YSciScale), abs=6e-9
-    )
+    scale = (aperture.XSciScale, aperture.YSciScale)
+    assert place.siaf_pixelscale == pytest.approx(scale, abs=6e-9)
     whole = siaf[f"{place.detector}_FULL"].det_to_sci(aperture.XDetRef, aperture.YDetRef)
     # The places measured in flight are up to 3.4 pixels from those of the SIAF.
     assert np.add(place.center, 1) == pytest.approx(whole, abs=3.5 if module == "A" else 0.005)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import math
 import re
 from pathlib import Path
@@ -16,22 +15,14 @@ from pyklip_diffrender.io.headers import KEYWORDS, fits_unit, set_keyword
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def written_keywords():
-    """Texts of the package's modules that look like keywords of its own."""
-    names = set()
-    for path in (ROOT / "pyklip_diffrender").rglob("*.py"):
-        if path.name == "keywords.py":
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                names |= {node.value} if re.fullmatch(r"DR[A-Z0-9]{2,6}", node.value) else set()
-    # The beginning of the names of a position and its error.
-    return names - {"DRFM"}
-
-
 def test_every_keyword_that_is_written_is_declared():
+    """By texts of the package's modules that look like keywords of its own."""
+    modules = (ROOT / "pyklip_diffrender").rglob("*.py")
+    texts = [each.read_text(encoding="utf-8") for each in modules if each.name != "keywords.py"]
+    written = set(re.findall(r"['\"](DR[A-Z0-9]{2,6})['\"]", "\n".join(texts)))
+    # The names of a position and its error are formed from their beginning.
     formed = {f"DRFM{axis}{end}" for axis in ("RA", "DE") for end in ("", "ER")}
-    assert written_keywords() | formed == set(KEYWORDS)
+    assert written - {"DRFM"} | formed == set(KEYWORDS)
 
 
 def test_keywords_fit_on_cards():
@@ -55,8 +46,7 @@ def test_values_are_such_as_headers_can_hold():
 
 
 @pytest.mark.parametrize(
-    ("unit", "text"),
-    [("MJy/sr", "MJy/sr"), ("MJy sr-1", "MJy/sr"), ("electron / s", "electron / s"), ("", "")],
+    ("unit", "text"), [("MJy sr-1", "MJy/sr"), ("electron / s", "electron / s"), ("", "")]
 )
 def test_units_are_spelled_as_the_pipeline_does(unit, text):
     assert fits_unit(u.Unit(unit)) == text

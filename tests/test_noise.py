@@ -22,22 +22,17 @@ def frames(noise, stated):
     return data[None], np.hypot(stated, photon)[None], photon[None]
 
 
-@pytest.mark.parametrize("noise", [0.3, 0.5, 0.8])
-def test_the_constant_part_of_the_errors_is_measured(noise):
+@pytest.mark.parametrize("noise", [0.3, 0.8])
+def test_the_constant_part_of_the_errors_is_measured_whatever_the_outliers(noise):
     data, error, photon = frames(noise, 0.5)
-    found, _ = calibrated_errors(data, error, np.ones(data.shape, bool), CENTER, SCALE)
-    np.testing.assert_allclose(found, np.hypot(noise, photon), rtol=0.03)
-
-
-def test_outliers_and_masked_pixels_do_not_change_the_factor():
-    data, error, photon = frames(0.3, 0.5)
     valid = np.ones(data.shape, bool)
+    found, _ = calibrated_errors(data, error, valid, CENTER, SCALE)
+    np.testing.assert_allclose(found, np.hypot(noise, photon), rtol=0.03)
     data[0, 5:15, 40:60] += 50.0  # A background source.
-    data[0, 20, ::7] = np.inf
     valid[0, 20, ::7] = False
     data[~valid] = 0.0
     found, _ = calibrated_errors(data, error, valid, CENTER, SCALE)
-    np.testing.assert_allclose(found[valid], np.hypot(0.3, photon)[valid], rtol=0.04)
+    np.testing.assert_allclose(found[valid], np.hypot(noise, photon)[valid], rtol=0.04)
     np.testing.assert_array_equal(found[~valid], error[~valid])
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from device_work import parameter_jacobian
+from derivatives import difference, parameter_jacobian
 from scipy.stats import multivariate_normal
 
 from pyklip_diffrender.errors import ShapeError
@@ -41,93 +41,85 @@ def system(**changes):
     return nircam_coronagraph("F444W", **settings)
 
 
-@pytest.fixture(scope="module")
-def opd():
-    return torch.from_numpy(random_opd(5, npix=NPIX).data)
-
-
-@pytest.fixture(scope="module")
-def values():
-    """Off every special point."""
-    given = {
+OPD = torch.from_numpy(random_opd(5, npix=NPIX).data)
+VALUES = {  # Off every special point.
+    name: torch.tensor(value, dtype=torch.float64)
+    for name, value in {
         "star_offset": (0.012, -0.007), "lyot_shift": (0.004, 0.002), "lyot_rotation": (0.3,),
         "blur": (0.02,),
-    }  # fmt: skip
-    return {name: torch.tensor(value, dtype=torch.float64) for name, value in given.items()}
+    }.items()
+}  # fmt: skip
 
 
-def slope(model, opd, change, values):
-    """Derivative of the image along a change of the OPD per nm, by central differences."""
-    step = 0.05 * NANOMETRE
+def slopes(model, opd, modes):
+    """Derivatives of the image along changes of the OPD per nm, by central differences."""
+    step, grid = 0.05 * NANOMETRE, PupilGrid.full(model.npix)
+    changes = torch.cat([BASIS.modes(grid, k, k + 1) for k in modes])
     with torch.no_grad():
-        ahead, behind = (model(opd + s * step * change, **values) for s in (1, -1))
+        ahead, behind = (model(opd + s * step * changes, **VALUES) for s in (1, -1))
     return (ahead - behind) / 0.1
 
 
-MODES = (0, 1, 29, 41, 54, 57, 90, len(BASIS) - 1)
+MODES = [0, 29, 41, 54, 57, 90, len(BASIS) - 1]
+SHEARED = {"pixelscale": (0.05, 0.08), "shear": 0.2, "oversample": 2}
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{}, pytest.param({"monochromatic": None, "nlambda": 2}, marks=pytest.mark.slow)],
-    ids=["1", "2"],
+    ("changes", "npix", "tolerance"),
+    [
+        ({}, NPIX, 1e-3),
+        ({"npix": 128, **SHEARED}, 128, 1e-3),
+        ({"npix": 128, "route": "planes"}, 128, 1e-4),
+        ({"monochromatic": None, "nlambda": 2}, 128, 0.025),
+    ],
+    ids=str,
 )
-@pytest.mark.parametrize(("npix", "tolerance"), [(NPIX, 1e-3), (128, 0.025)])
-def test_wavefront_response_is_the_slope_of_the_fine_model(opd, values, changes, npix, tolerance):
+def test_wavefront_response_is_the_slope_of_the_fine_model(changes, npix, tolerance):
     """To the wrapped light of the occulter on the same grid; a coarse copy is off by a percent."""
     model = system(**changes)
-    response = WavefrontResponse(model, BASIS, opd, values, npix=npix)
+    opd = downsample(OPD, model.npix)
+    response = WavefrontResponse(model, BASIS, opd, VALUES, npix=npix)
     assert response.coarse.npix == npix
-    image = response.image(model.fields(opd, **values), values)
+    image = response.image(model.fields(opd, **VALUES), VALUES)
     assert image.shape == (len(BASIS), 20, 24)
-    grid = PupilGrid.full(NPIX)
-    for k in MODES:
-        expected = slope(model, opd, BASIS.modes(grid, k, k + 1)[0], values)
-        error = (image[k] - expected).norm() / expected.norm()
-        assert float(error) < tolerance, k
+    expected = slopes(model, opd, MODES)
+    error = (image[MODES] - expected).flatten(1).norm(dim=1) / expected.flatten(1).norm(dim=1)
+    assert float(error.max()) < tolerance
 
 
-def test_wavefront_response_takes_the_field_of_the_star_it_is_asked_about(opd, values):
+def test_wavefront_response_takes_the_field_of_the_star_it_is_asked_about():
     """Kept from one wavefront, used at another 12 nm away: the slope there, not the old one."""
     model = system()
-    grid = PupilGrid.full(NPIX)
     coefficients = torch.zeros(len(BASIS), dtype=torch.float64)
     coefficients[[0, 20, 60, 61]] = torch.tensor([20.0, -20.0, 8.0, 8.0], dtype=torch.float64)
-    moved = opd + BASIS.opd(coefficients, grid) * NANOMETRE
-    response = WavefrontResponse(model, BASIS, opd, values, npix=NPIX)
-    there = response.image(model.fields(moved, **values), values)
-    here = response.image(model.fields(opd, **values), values)
+    moved = OPD + BASIS.opd(coefficients, PupilGrid.full(NPIX)) * NANOMETRE
+    response = WavefrontResponse(model, BASIS, OPD, VALUES, npix=NPIX)
+    there = response.image(model.fields(moved, **VALUES), VALUES)
+    here = response.image(model.fields(OPD, **VALUES), VALUES)
     chosen = [29, 41, 57, 90, 110]
-    expected = torch.stack(
-        [slope(model, moved, BASIS.modes(grid, k, k + 1)[0], values) for k in chosen]
-    )
-    error, old_error = (
-        float((image[chosen] - expected).norm() / expected.norm()) for image in (there, here)
-    )
+    expected = slopes(model, moved, chosen)
+    error, old_error = (float((a[chosen] - expected).norm()) for a in (there, here))
     # The field's derivative turns with the pupil's phase, by little: the image's does more.
-    assert error < 0.025
+    assert error < 0.025 * float(expected.norm())
     assert error < 0.6 * old_error
-    fields = [2 * field for field in model.fields(opd, **values)]
-    torch.testing.assert_close(response.image(fields, values), 2 * here, rtol=1e-6, atol=0)
+    fields = [2 * field for field in model.fields(OPD, **VALUES)]
+    torch.testing.assert_close(response.image(fields, VALUES), 2 * here, rtol=1e-6, atol=0)
 
 
-def test_responses_that_are_not_stored_are_the_same(opd, values):
+def test_responses_that_are_not_stored_are_the_same():
     """Room for one response: the other is computed again, about its own wavefront."""
     model = system(npix=64)
-    start = downsample(opd, 64)
+    start = downsample(OPD, 64)
     basis = FourierModes(3)
-    fields = model.fields(start, **values)
-    images = {}
+    fields = model.fields(start, **VALUES)
+    every = []
     for memory in (math.inf, 8 * len(basis) * 20 * 24, 100.0):
         responses = ResponseCache(model, basis, npix=64, keep=2, memory=memory)
-        near, far = (
-            responses.near(shifted, values)
-            for shifted in (start, start + 2e-7 * model.entrance.lit)
-        )
-        assert responses.near(start, values) is near
+        places = (start, start + 2e-7 * model.entrance.lit)
+        near, far = (responses.near(opd, VALUES) for opd in places)
+        assert responses.near(start, VALUES) is near
         assert (near.stored, far.stored) == (memory == math.inf, memory > 1000)
-        images[memory] = [each.image(fields, values, 5) for each in (near, far)]
-    every = list(images.values())
+        every.append([each.image(fields, VALUES, 5) for each in (near, far)])
     for others in every[1:]:
         for image, expected in zip(others, every[0], strict=True):
             assert float((image - expected).norm() / expected.norm()) < 1e-6
@@ -143,11 +135,8 @@ def stored(response):
 def relative(fields, expected, edge=0):
     """Relative difference of fields, without so many pixels at the edges."""
     inside = slice(edge, -edge or None)
-    parts = [
-        ((a - b)[..., inside, inside].norm(), b[..., inside, inside].norm())
-        for a, b in zip(fields, expected, strict=True)
-    ]
-    return float(sum(p[0] ** 2 for p in parts) ** 0.5 / sum(p[1] ** 2 for p in parts) ** 0.5)
+    one, other = (torch.cat(each)[..., inside, inside] for each in (fields, expected))
+    return float((one - other).norm() / other.norm())
 
 
 MOVES = {
@@ -157,22 +146,16 @@ MOVES = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [*(pytest.param(each, marks=pytest.mark.slow) for each in MOVES), "all"]
-)
 @pytest.mark.parametrize("route", ["lattice", "planes"])
-def test_derivatives_follow_changes_in_the_last_pupil(opd, values, name, route):
+def test_derivatives_follow_changes_in_the_last_pupil(route):
     """Against derivatives that are computed anew; the errors are those of the field's edges."""
     model = system(npix=64, fov_pixels=(44, 48), route=route)
-    start = downsample(opd, 64)
-    before = {**values, "si_zernikes": torch.zeros(36, dtype=torch.float64),
+    start = downsample(OPD, 64)
+    before = {**VALUES, "si_zernikes": torch.zeros(36, dtype=torch.float64),
               "detector_shift": torch.tensor([0.02, 0.01], dtype=torch.float64)}  # fmt: skip
-    after = dict(before)
-    for each in MOVES if name == "all" else (name,):
-        after[each] = before[each] + torch.as_tensor(MOVES[each])
+    after = before | {name: before[name] + torch.as_tensor(move) for name, move in MOVES.items()}
     kept, anew = (WavefrontResponse(model, BASIS, start, at, npix=64) for at in (before, after))
-    old, expected = stored(kept), stored(anew)
-    old = [each.clone() for each in old]
+    old, expected = [each.clone() for each in stored(kept)], stored(anew)
     last = LastPupil(kept.coarse)
     assert 0.05 < last.change(before, after) < 1
     kept.follow(last, after)
@@ -184,63 +167,50 @@ def test_derivatives_follow_changes_in_the_last_pupil(opd, values, name, route):
 
 
 @pytest.mark.hard
-def test_piston_of_the_whole_pupil_does_nothing(opd):
-    model = system(npix=128)
-    response = WavefrontResponse(model, SegmentMotions(), downsample(opd, 128), {}, npix=128)
-    image = response.image(model.fields(downsample(opd, 128)), {})
-    together = image[0::3].sum(dim=0)
-    # The outlines, widened to the middle of the gaps, leave a few thousandths at the corners.
-    assert float(together.norm()) < 5e-3 * float(image[0::3].norm())
-
-
-NAMES = ("star_offset", "lyot_shift", "lyot_rotation", "si_zernikes", "detector_shift", "blur")
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("name", NAMES)
-def test_parameter_jacobian_is_the_slope_of_the_model(opd, values, name):
-    model = system(npix=64)
-    small = downsample(opd, 64)
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("star_offset", {}), ("lyot_shift", {"route": "planes"}), ("lyot_rotation", {}),
+        ("si_zernikes", {}), ("detector_shift", SHEARED), ("detector_shift", {"route": "planes"}),
+        ("blur", {"oversample": 2}),
+    ],
+)  # fmt: skip
+def test_parameter_jacobian_is_the_slope_of_the_model(name, changes):
+    model = system(npix=64, **changes)
+    small = downsample(OPD, 64)
     entry = parameter(name)
-    start = values.get(name, torch.zeros(entry.size, dtype=torch.float64))
-    given = {**values, name: start}
+    start = VALUES.get(name, torch.zeros(entry.size, dtype=torch.float64))
+    given = {**VALUES, name: start}
     jacobian = parameter_jacobian(model, small, given, (name,))
     assert jacobian.shape == (entry.size, 20, 24)
     for k in range(entry.size > 2, entry.size, 7):  # The first Zernike is piston, unseen.
         # Areas of cut pixels are only once differentiable: the Lyot stop takes small steps.
         step = (1e-5 if name.startswith("lyot") else 1e-3) * entry.prior
-        change = torch.zeros(entry.size, dtype=torch.float64)
-        change[k] = step
-        with torch.no_grad():
-            at = [model(small, **{**given, name: start + s * change}) for s in (-2, -1, 1, 2)]
-        expected = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step)
+        unit = torch.eye(entry.size, dtype=torch.float64)[k]
+        expected = difference(lambda v: model(small, **{**given, name: v}), start, unit, step)
         assert float((jacobian[k] - expected).norm() / expected.norm()) < 1e-5
 
 
 @pytest.mark.parametrize(
     ("filter_name", "mask", "size", "npix"),
-    [("F182M", "MASKSWB", 32, 128), ("F182M", "MASKSWB", 240, 256), ("F250M", "MASKLWB", 32, 128),
-     ("F480M", "MASKLWB", 80, 128), ("F182M", "MASK335R", 32, 128)],
-)  # fmt: skip
+    [("F182M", "MASKSWB", 240, 256), ("F480M", "MASKLWB", 80, 128), ("F182M", "MASK335R", 32, 128)],
+)
 def test_copies_of_the_star_do_not_touch_the_mask(filter_name, mask, size, npix):
     """Images of 128 samples at 1.8 um repeat after 7 arcsec."""
     model = nircam_coronagraph(filter_name, image_mask=mask, npix=512, fov_pixels=size)
     assert coarse_copy(model).npix == npix
 
 
-@pytest.mark.parametrize("mask", ["MASKSWB", "MASK335R"])
-def test_derivatives_behind_a_bar_are_as_exact_as_behind_a_round_mask(mask):
+def test_derivatives_behind_a_bar_are_as_exact_as_behind_a_round_mask():
     """They need the bar near the field only, a quarter of its length."""
-    model = nircam_coronagraph("F210M", image_mask=mask, npix=256, fov_pixels=32, nlambda=2)
+    model = nircam_coronagraph("F210M", image_mask="MASKSWB", npix=256, fov_pixels=32, nlambda=1)
     opd = torch.from_numpy(random_opd(3, npix=256, rms=60e-9).data)
-    coarse, exact = (WavefrontResponse(model, FourierModes(6), opd, {}, npix=n) for n in (128, 256))
+    coarse, exact = (WavefrontResponse(model, FourierModes(4), opd, {}, npix=n) for n in (128, 256))
     assert exact.coarse is model
-    assert coarse.coarse.recipe["bar_reach"] == (
-        pytest.approx(2.5, abs=0.01) if "WB" in mask else None
-    )
+    assert coarse.coarse.recipe["bar_reach"] == pytest.approx(2.5, abs=0.01)
     fields = model.fields(opd)
-    difference = coarse.image(fields, {}) - exact.image(fields, {})
-    assert difference.norm() < 0.01 * exact.image(fields, {}).norm()
+    image, expected = coarse.image(fields, {}), exact.image(fields, {})
+    assert (image - expected).norm() < 0.01 * expected.norm()
 
 
 @pytest.fixture
@@ -263,16 +233,11 @@ def linear():
 
 
 def solved(linear, scales, iterations):
+    design = linear["design"]
     return solve_with_evidence(
-        linear["design"].T @ linear["design"],
-        linear["design"].T @ linear["observed"],
-        linear["shape"],
-        linear["group"],
-        scales,
-        linear["fixed"],
-        iterations=iterations,
-        errors=True,
-    )
+        design.T @ design, design.T @ linear["observed"], linear["shape"], linear["group"], scales,
+        linear["fixed"], iterations=iterations, errors=True,
+    )  # fmt: skip
 
 
 def test_with_fixed_scales_the_solution_is_that_of_ridge_regression(linear):
@@ -324,24 +289,16 @@ def test_what_no_wavefront_explains_ends_at_the_ceiling():
     design = torch.randn(60, 40, dtype=torch.float64, generator=generator)
     design = torch.cat([design, design + 1e-9 * design.roll(1, 0)], dim=1)
     observed = 1e8 * torch.randn(60, dtype=torch.float64, generator=generator)
-    got = solve_with_evidence(
-        design.T @ design,
-        design.T @ observed,
-        torch.ones(80, dtype=torch.float64),
-        torch.zeros(80, dtype=torch.int64),
-        torch.tensor([1.0], dtype=torch.float64),
-        torch.zeros(0, dtype=torch.float64),
-        iterations=5,
-        errors=True,
-    )
+    nothing = torch.zeros(0, dtype=torch.float64)
+    one, group = torch.ones(80, dtype=torch.float64), torch.zeros(80, dtype=torch.int64)
+    problem = {"design": design, "observed": observed, "shape": one, "group": group}
+    got = solved({**problem, "fixed": nothing}, one[:1], 5)
     assert float(got.scales[0]) == 100.0
-    assert got.variance is not None
     assert bool(torch.isfinite(got.step).all() and torch.isfinite(got.variance).all())
 
 
 def test_the_prior_falls_with_frequency():
-    prior = WavefrontPrior(knee=3.0, slope=2.0)
-    shape = prior.shape(BASIS)
+    shape = WavefrontPrior(knee=3.0, slope=2.0).shape(BASIS)
     assert (shape[:54] == 1).all()
     at_three = (BASIS.frequencies == 3.0) & (BASIS.group_index == 1)
     assert at_three.any()
@@ -359,11 +316,8 @@ def test_a_prior_is_learnt_from_maps():
     grid = PupilGrid.full(128)
     mirror = (jwst_pupil(128) > 0).numpy()
     generator = torch.Generator().manual_seed(3)
-    steps = [
-        basis.opd(torch.randn(len(basis), dtype=torch.float64, generator=generator) * deviation,
-                  grid).numpy() * 1e-9 * mirror
-        for _ in range(12)
-    ]  # fmt: skip
+    drawn = torch.randn(12, len(basis), dtype=torch.float64, generator=generator) * deviation
+    steps = [basis.opd(each, grid).numpy() * 1e-9 * mirror for each in drawn]
     maps = np.cumsum([np.zeros((128, 128)), *steps], axis=0)
     found = learn_prior(maps, basis)
     # Segment motions and low Fourier modes look alike: what one has, the other may take.

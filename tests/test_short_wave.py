@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+import small_files
 import torch
 from astropy import units as u
 from astropy.io import fits
@@ -19,65 +21,50 @@ from pyklip_diffrender.scene.jwst_files import mask_place
 from pyklip_diffrender.wavefront import random_opd
 
 SIZE = 36
+CENTER = np.array([31.3, 32.6])
 PLANET = Planet(3e-4, 0.45, 60.0)
 PHOTONS = 1e10  # Of the star, in a frame.
 NOISE = 30.0
 STAR = (0.002, -0.002)  # arcsec from the middle of the mask.
 
 
-def calints(folder, roll, *, filter="F210M", module="A", seed=0):
-    """A simulated frame of 64 x 64 pixels, with a planet behind MASK335R, as MAST delivers it."""
-    mask = "MASK335R"
-    place = detector_place(mask, filter, module=module)
-    star = np.array([31.3, 32.6])
+@cache
+def scene(place):
+    """Photons of a star and its planet behind MASK335R, 64 x 64 pixels."""
+    scale = place.siaf_pixelscale
     model = nircam_coronagraph(
-        filter,
-        image_mask=mask,
-        module=module,
-        npix=256,
-        nlambda=5,
-        fov_pixels=64,
-        pixelscale=place.siaf_pixelscale,
-        shear=place.siaf_shear,
+        "F210M" if place.short_wave else "F444W", image_mask="MASK335R", module=place.module,
+        npix=256, nlambda=5, fov_pixels=64, pixelscale=scale, shear=place.siaf_shear,
         # Not where the fit starts.
         defaults={"lyot_shift": (-0.006, 0.004), "lyot_rotation": 0.2},
-    )
+    )  # fmt: skip
     opd = random_opd(1, npix=256).data + random_opd(2, npix=256, rms=5e-9).data
-    moved = {"detector_shift": tuple((star - 31.5) * place.siaf_pixelscale)}
-    planet = PLANET.rotated(-roll).offset
+    moved = {"detector_shift": tuple((CENTER - 31.5) * scale)}
     with torch.no_grad():
         light = model(opd, STAR, **moved)
-        light += PLANET.contrast * model(opd, tuple(np.add(STAR, planet)), **moved)
-    counts = PHOTONS * light.numpy()
+        light += PLANET.contrast * model(opd, tuple(np.add(STAR, PLANET.offset)), **moved)
+    return PHOTONS * light.numpy()
+
+
+def calints(folder, filter="F210M", module="A"):
+    """Write a frame as MAST delivers it."""
+    place = detector_place("MASK335R", filter, module=module)
+    counts = scene(place)
     sigma = np.sqrt(counts + NOISE**2)
-    counts = counts + sigma * np.random.default_rng(seed).normal(size=sigma.shape)
-    corner = np.round(np.add(place.center, filter_shift(filter)) - star) + 1
+    counts = counts + sigma * np.random.default_rng(0).normal(size=sigma.shape)
+    corner = np.round(np.add(place.center, filter_shift(filter)) - CENTER) + 1
     primary = {
-        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON",
-        "DETECTOR": place.header_detector, "MODULE": module, "FILTER": filter, "PUPIL": "MASKRND",
-        "CORONMSK": f"MASK{module}335R", "SUBARRAY": f"SUB320{module}335R",
-        "APERNAME": f"{place.detector}_{mask}", "TARGPROP": "HD 1",
-        "SUBSTRT1": int(corner[0]), "SUBSTRT2": int(corner[1]),
-        "DATE-BEG": f"2024-03-0{seed + 1}T00:00:00",
+        "TELESCOP": "JWST", "EXP_TYPE": "NRC_CORON", "DETECTOR": place.header_detector,
+        "MODULE": module, "FILTER": filter, "PUPIL": "MASKRND", "CORONMSK": f"MASK{module}335R",
+        "SUBARRAY": f"SUB320{module}335R", "APERNAME": f"{place.detector}_MASK335R",
+        "TARGPROP": "HD 1", "SUBSTRT1": int(corner[0]), "SUBSTRT2": int(corner[1]),
     }  # fmt: skip
-    science = {
-        "BUNIT": "MJy/sr", "PIXAR_A2": float(np.prod(place.siaf_pixelscale)),
-        "PIXAR_SR": float(np.prod(place.siaf_pixelscale)) * 2.35e-11,
-        "CRPIX1": star[0] + 1, "CRPIX2": star[1] + 1, "ROLL_REF": roll, "V3I_YANG": 0.0,
-        "VPARITY": -1,
-    }  # fmt: skip
-    hdus = fits.HDUList(
-        [
-            fits.PrimaryHDU(header=fits.Header(primary)),
-            fits.ImageHDU(counts[None] / 1e3, fits.Header(science), name="SCI"),
-            fits.ImageHDU(sigma[None] / 1e3, name="ERR"),
-            fits.ImageHDU(np.zeros((1, 64, 64), "i4"), name="DQ"),
-        ]
-    )
-    detector = place.header_detector.lower()
-    path = folder / f"jw01000001001_03106_0000{seed + 1}_{detector}_calints.fits"
-    hdus.writeto(path)
-    return path
+    area = float(np.prod(place.siaf_pixelscale))
+    science = {"PIXAR_A2": area, "PIXAR_SR": area * 2.35e-11, "ROLL_REF": 0.0, "V3I_YANG": 0.0,
+               "CRPIX1": CENTER[0] + 1, "CRPIX2": CENTER[1] + 1}  # fmt: skip
+    path = folder / f"jw01000001001_03106_00001_{place.header_detector.lower()}_calints.fits"
+    data, error = counts[None] / 1e3, sigma[None] / 1e3
+    return small_files.calints(path, data, error, primary=primary, **science)
 
 
 @pytest.mark.slow
@@ -85,7 +72,7 @@ def calints(folder, roll, *, filter="F210M", module="A", seed=0):
 def test_a_planet_is_where_it_is_and_nothing_else(tmp_path, filter, module):
     """A map that is 5 nm rms off, a star and a stop off their places, and no flat-field pattern."""
     settings = GaussNewton.nircam(filter, module=module, cycles=(7.0,), max_iterations=10)
-    frame, opd = calints(tmp_path, 0.0, filter=filter, module=module), random_opd(1, npix=256)
+    frame, opd = calints(tmp_path, filter, module), random_opd(1, npix=256)
     result = reduce([frame], opd, size=SIZE, settings=settings)
     assert result.systematics is None
     assert result.fit is result.detection.fits[0]
@@ -99,7 +86,7 @@ def test_a_planet_is_where_it_is_and_nothing_else(tmp_path, filter, module):
 
 
 def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path):
-    (frame,) = Sequence.from_files([calints(tmp_path, 0.0)]).science
+    (frame,) = Sequence.from_files([calints(tmp_path)]).science
     assert frame.first_pixel is not None  # The star is where the mask is on NRCA2.
     model = model_for(frame, SIZE)
     place = detector_place("MASK335R", "F210M")
@@ -111,10 +98,8 @@ def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path):
     short = settings_for(frame)
     assert short.cycles == long.cycles == (18.0,)
     assert short.deviations["lyot_shift"] > 2 * long.deviations["lyot_shift"]
-    wide = Observation.from_arrays(
-        np.ones((160, 160)), np.ones((160, 160)), pixelscale=0.031, filter="F182M",
-        header=fits.Header({"INSTRUME": "NIRCAM"}),
-    )  # fmt: skip
+    ones, header = np.ones((160, 160)), fits.Header({"INSTRUME": "NIRCAM"})
+    wide = Observation.from_arrays(ones, ones, pixelscale=0.031, filter="F182M", header=header)
     # A model that is given needs no mask in the header.
     frame.header.update({"CORONMSK": "NONE", "APERNAME": "NRCA2_FULL", "SUBARRAY": "FULL"})
     assert settings_for(frame).deviations == short.deviations
@@ -124,7 +109,7 @@ def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path):
 
 def test_frames_of_module_b_have_its_model(tmp_path):
     """Nothing that was measured in flight with module A is taken for it."""
-    path = calints(tmp_path, 0.0, filter="F444W", module="B")
+    path = calints(tmp_path, "F444W", "B")
     (frame,) = Sequence.from_files([path]).science
     assert frame.header["DETECTOR"] == "NRCBLONG"
     model = model_for(frame, SIZE)
@@ -141,12 +126,11 @@ def test_frames_of_module_b_have_its_model(tmp_path):
         del frame.header[key]
     # The archive's name of the file names the detector, CORONMSK the module.
     assert model_for(frame, SIZE) is model
-    named = replace(frame, name="a frame")
-    assert model_for(named, SIZE) is model
+    assert model_for(replace(frame, name="a frame"), SIZE) is model
 
 
 def test_what_is_not_modelled_is_refused(tmp_path):
-    path = calints(tmp_path, 0.0)
+    path = calints(tmp_path)
     (frame,) = Sequence.from_files([path]).science
     frame.header["DETECTOR"] = "NRCA4"
     with pytest.raises(IncompatibleSetupError, match=r"detector NRCA4, expected NRCA2"):
@@ -164,9 +148,8 @@ def test_what_is_not_modelled_is_refused(tmp_path):
 
 def test_the_place_along_a_bar_is_that_of_the_header():
     ones = np.ones((24, 24))
-    header = fits.Header(
-        {"INSTRUME": "NIRCAM", "CORONMSK": "MASKALWB", "APERNAME": "NRCA5_MASKLWB_NARROW"}
-    )
+    cards = {"INSTRUME": "NIRCAM", "CORONMSK": "MASKALWB", "APERNAME": "NRCA5_MASKLWB_NARROW"}
+    header = fits.Header(cards)
     frame = Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F335M", header=header)
     model = model_for(frame, monochromatic=3.35e-6)
     assert model.setup["pupil_mask"] == "MASKBAR"

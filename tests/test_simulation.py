@@ -20,7 +20,7 @@ from pyklip_diffrender.scene import (
     simulate,
     star_photons,
 )
-from pyklip_diffrender.wavefront import random_opd, read_opd
+from pyklip_diffrender.wavefront import random_opd
 
 WAVELENGTH = 4.5e-6
 NPIX = 96
@@ -43,17 +43,14 @@ def test_the_papers_star_sends_the_papers_photons():
 
 def test_photons_follow_magnitude_exposure_and_gain():
     star = Star()
-    assert replace(star, w2_magnitude=star.w2_magnitude + 2.5).photons == pytest.approx(
-        star.photons / 10, rel=1e-12
-    )
-    assert replace(star, exposure=400.0).photons == pytest.approx(star.photons / 18, rel=1e-12)
-    assert replace(star, gain=2 * star.gain).photons == pytest.approx(2 * star.photons, rel=1e-12)
-    assert replace(star, quantum_efficiency=0.4).photons == pytest.approx(
-        2 * star.photons, rel=1e-12
-    )
-    assert Star(w2_magnitude=ALPHA_PICTORIS_W2, exposure=400.0).photons == pytest.approx(
-        star.photons / 18 * 10 ** (0.4 * 2.203), rel=1e-12
-    )
+    for changes, factor in (
+        ({"w2_magnitude": star.w2_magnitude + 2.5}, 1 / 10),
+        ({"exposure": 400.0}, 1 / 18),
+        ({"gain": 2 * star.gain}, 2.0),
+        ({"quantum_efficiency": 0.4}, 2.0),
+        ({"w2_magnitude": ALPHA_PICTORIS_W2, "exposure": 400.0}, 10 ** (0.4 * 2.203) / 18),
+    ):
+        assert replace(star, **changes).photons == pytest.approx(factor * star.photons, rel=1e-12)
 
 
 def test_the_unocculted_star_has_the_papers_peak():
@@ -75,16 +72,17 @@ def test_the_unocculted_star_has_the_papers_peak():
     ("angle", "direction"), [(0, (0, 1)), (90, (-1, 0)), (180, (0, -1)), (270, (1, 0))]
 )
 def test_position_angle_is_counter_clockwise_from_up(angle, direction):
-    np.testing.assert_allclose(
-        Planet(1e-6, 0.8, angle).offset, 0.8 * np.array(direction), atol=1e-15
-    )
+    offset = 0.8 * np.array(direction)
+    np.testing.assert_allclose(Planet(1e-6, 0.8, angle).offset, offset, atol=1e-15)
+    planet = Planet.from_offset(1e-4, *offset)
+    assert planet.position_angle % 360 == pytest.approx(angle)
+    assert planet.offset == pytest.approx(tuple(offset), abs=1e-12)
 
 
-@pytest.mark.parametrize("angle", [20.0, 110.0, 200.0, 290.0])
+@pytest.mark.parametrize("angle", [20.0, 200.0])
 def test_a_planet_appears_where_it_was_put(model, opd, angle):
     scene = Scene(star_offset=(0.05, -0.03))
-    planet = Planet(1e-3, 0.75, angle)
-    image = planet_photons(model, scene, planet, opd)
+    image = planet_photons(model, scene, Planet(1e-3, 0.75, angle), opd)
     scale = model.detector.pixelscale[0]
     ny, nx = image.shape
     # Up is +y (rows), left is -x: angles from up to the left.
@@ -95,21 +93,8 @@ def test_a_planet_appears_where_it_was_put(model, opd, angle):
     total = image[core].sum()
     assert float((image * x)[core].sum() / total) == pytest.approx(expected_x, abs=0.35)
     assert float((image * y)[core].sum() / total) == pytest.approx(expected_y, abs=0.35)
-    assert np.hypot(*(np.array(np.unravel_index(image.argmax(), image.shape))
-                      - (expected_y, expected_x))) < 1.0  # fmt: skip
-
-
-@pytest.mark.hard
-def test_planet_photons_are_linear_in_contrast(model, opd):
-    scene = Scene()
-    one = planet_photons(model, scene, Planet(1e-6, 0.6, 54), opd)
-    assert one.max() > 0
-    for contrast in (0.0, 1e-10, 5e-6, 1e-3):
-        np.testing.assert_allclose(
-            planet_photons(model, scene, Planet(contrast, 0.6, 54), opd),
-            one * (contrast / 1e-6),
-            rtol=1e-12,
-        )
+    brightest = np.unravel_index(image.argmax(), image.shape)
+    assert np.hypot(*np.subtract(brightest, (expected_y, expected_x))) < 1.0
 
 
 def test_a_scene_is_the_sum_of_its_parts(model, opd):
@@ -119,11 +104,12 @@ def test_a_scene_is_the_sum_of_its_parts(model, opd):
     parts = parts + sum(planet_photons(model, scene, p, opd) for p in planets)
     total = expected_photons(model, scene, opd)
     np.testing.assert_allclose(total, parts, rtol=1e-12)
+    one, faint = (planet_photons(model, scene, Planet(c, 0.6, 54), opd) for c in (1e-5, 1e-10))
+    np.testing.assert_allclose(faint, 1e-5 * one, rtol=1e-12)
     # A brighter star, and its planets with it: contrasts are relative.
     brighter = replace(scene, star=replace(scene.star, w2_magnitude=2.182), background=0.0)
-    np.testing.assert_allclose(
-        expected_photons(model, brighter, opd), (total - 321.0) * 10**0.4, rtol=1e-9
-    )
+    seen = expected_photons(model, brighter, opd)
+    np.testing.assert_allclose(seen, (total - 321.0) * 10**0.4, rtol=1e-9)
 
 
 def test_noise_has_the_mean_and_variance_of_photons_and_readout():
@@ -151,47 +137,16 @@ def test_noise_has_the_mean_and_variance_of_photons_and_readout():
 
 
 @pytest.mark.hard
-def test_the_same_seed_gives_the_same_frames(model, opd):
+def test_a_simulation_says_what_it_is_and_the_same_seed_gives_the_same_frames(model, opd):
     scene = Scene(planets=(Planet(1e-5, 0.6, 54),))
-    first = simulate(model, scene, opd, seed=8, frames=2)
-    again = simulate(model, scene, opd, seed=8, frames=2)
-    other = simulate(model, scene, opd, seed=9, frames=2)
-    assert first.data.tobytes() == again.data.tobytes()
-    assert not np.array_equal(first.data, other.data)
-    assert not np.array_equal(first.data[0], first.data[1])
-
-
-def test_a_simulation_says_what_it_is(model, opd):
-    got = simulate(model, Scene(), opd, seed=4, frames=3)
+    got, again, other = (simulate(model, scene, opd, seed=s, frames=3) for s in (8, 8, 9))
+    assert got.data.tobytes() == again.data.tobytes()
+    assert not np.array_equal(got.data, other.data)
+    assert not np.array_equal(got.data[0], got.data[1])
     assert got.data.shape == (3, 32, 36)
-    assert got.unit == u.photon
-    assert got.filter == "F444W"
+    assert (got.unit, got.filter) == (u.photon, "F444W")
     assert got.pixelscale == model.detector.pixelscale
     assert got.valid.all()
-    assert "seed=4" in got.name
+    assert "seed=8" in got.name
     np.testing.assert_array_equal(got.center, [[17.5, 15.5]] * 3)
     np.testing.assert_allclose(got.error, np.sqrt(np.maximum(got.data, 0) + 42.0**2), rtol=1e-14)
-
-
-@pytest.mark.slow
-def test_the_papers_scene_behind_the_official_stop_is_fainter_than_published(shared_data):
-    model = nircam_coronagraph("F444W", monochromatic=WAVELENGTH, segment_gap=0.0)
-    pair = [read_opd(shared_data / f"opd_2022-08-{day}.fits.gz") for day in (11, 14)]
-    before, after = (opd.data for opd in pair)
-    star = star_photons(model, Scene(), before + 40 / 86 * (after - before))
-    # The paper states 1.12e7 photons in the brightest pixel and 1.2e6 in the ring. Both came out
-    # with a stop that was digitised from a figure and stood 2.8 % of the pupil too high.
-    assert star.max() == pytest.approx(6.4e6, rel=0.05)
-    y, x = np.indices(star.shape)
-    separation = np.hypot(x - 39.5, y - 39.5) * 0.062424185
-    ring = np.abs(separation - 0.7) <= 0.2
-    assert 0.5 < star[ring].mean() / 1.2e6 < 0.9
-
-
-@pytest.mark.parametrize(
-    ("x", "y", "angle"), [(0.0, 0.5, 0.0), (-0.5, 0.0, 90.0), (0.0, -0.5, 180.0), (0.5, 0.0, 270.0)]
-)
-def test_position_angles_are_counter_clockwise_from_up(x, y, angle):
-    planet = Planet.from_offset(1e-4, x, y)
-    assert planet.position_angle % 360 == pytest.approx(angle)
-    assert planet.offset == pytest.approx((x, y), abs=1e-12)

@@ -95,7 +95,7 @@ def _optics() -> list[Breakage]:
         Breakage(
             "array-turn", "a turned array shows the turned pupil",
             "((a + b, -1), (c + d, -2))", "((a + b, -2), (c + d, -1))",
-            "orientation bridges_poppy",
+            "bridges_poppy",
         ),
     ]  # fmt: skip
 
@@ -123,7 +123,7 @@ def _instrument_and_wavefront() -> list[Breakage]:
         Breakage(
             "quadrature", "condensed wavelengths keep the integrals of polynomials",
             "nodes.tolist()), tuple((vectors[0] ** 2).tolist()))\n\n    @property",
-            "nodes.tolist()), tuple(abs(vectors[0]).tolist()))\n\n    @property", "bandpass",
+            "nodes.tolist()), tuple(abs(vectors[0]).tolist()))\n\n    @property", "optics",
         ),
         Breakage(
             "drift-size", "random drifts grow with the hours",
