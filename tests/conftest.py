@@ -137,6 +137,29 @@ def stpsf_path(tmp_path_factory):
 
 
 @pytest.fixture
+def offline(monkeypatch):
+    """JWSTData asks a web service for its filters, and falls back to tables without."""
+    from pyklip.instruments import JWST
+
+    def refuse(**kw):
+        raise OSError("offline")
+
+    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", refuse)
+
+
+@pytest.fixture
+def registered():
+    """The backend in pyKLIP, with a subtractor that renders the star of `backend_scene`."""
+    from backend_scene import OPD, render
+
+    from pyklip_diffrender.pyklip_backend import register, unregister
+
+    register(opd=OPD, subtractor=render)
+    yield
+    unregister()
+
+
+@pytest.fixture
 def killed():
     """Runs a program with a path, and kills it as soon as it prints a line."""
 
