@@ -15,11 +15,7 @@ from pyklip.instruments.JWST import JWSTData
 from pyklip.klip import high_pass_filter
 
 from pyklip_diffrender.errors import DiffrenderWarning
-from pyklip_diffrender.pyklip_backend import (
-    DiffrenderSettings,
-    backend,
-    observation_from_dataset,
-)
+from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, observation_from_dataset
 
 NATIVE = (20.7, 25.2)
 MIDDLE = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
