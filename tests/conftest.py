@@ -104,8 +104,7 @@ def shared_data():
     """Folder of real frames and wavefront maps, too large to come with the code.
 
     It is ``data`` in the folder named by PYKLIP_DIFFRENDER_SHARED, or in ``shared`` next to the
-    project. Without either, the tests that need it are skipped; a variable that points nowhere
-    is a mistake, and fails them.
+    project. Without either, the tests are skipped; a variable that points nowhere fails them.
     """
     named = os.environ.get("PYKLIP_DIFFRENDER_SHARED")
     data = (Path(named) if named else ROOT.parent / "shared") / "data"
@@ -126,14 +125,10 @@ def stpsf_path(tmp_path_factory):
         pytest.skip("needs stpsf, the extra 'webbpsf'")
     from stpsf_data import make_stpsf_data
 
-    before = os.environ.get("STPSF_PATH")
     folder = make_stpsf_data(tmp_path_factory.mktemp("stpsf") / "data", npix=256)
-    os.environ["STPSF_PATH"] = str(folder)
-    yield folder
-    if before is None:
-        del os.environ["STPSF_PATH"]
-    else:
-        os.environ["STPSF_PATH"] = before
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STPSF_PATH", str(folder))
+        yield folder
 
 
 @pytest.fixture

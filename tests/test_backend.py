@@ -259,32 +259,6 @@ def test_nan_where_pyklip_has_nan(outer, imgs, tmp_path):
 
 
 @pytest.mark.usefixtures("registered")
-def test_frames_padded_with_nan(imgs, tmp_path):
-    pad, middle = 16, np.array(CENTER)
-    wide = np.pad(imgs, ((0, 0), (pad, pad), (pad, pad)), constant_values=np.nan)
-    plain, padded = generic(imgs, ANGLES), generic(wide, ANGLES, center=middle + pad)
-    reduced(plain, tmp_path / "a", annuli=2, aligned_center=CENTER)
-    padded.OWA = plain.OWA = 40.0
-    image, _ = reduced(padded, tmp_path / "b", annuli=2, aligned_center=middle + pad)[PRODUCT]
-    assert image.shape[1:] == wide.shape[1:]
-    inner = padded.output[..., pad:-pad, pad:-pad]
-    both = np.isfinite(inner) & np.isfinite(plain.output)
-    assert both.mean() > 0.5
-    np.testing.assert_allclose(inner[both], plain.output[both], atol=0.03)
-
-
-@pytest.mark.usefixtures("registered")
-@pytest.mark.parametrize("mode", ["RDI", "ADI"])
-def test_a_single_frame_without_header(mode, imgs, tmp_path):
-    dataset = generic(imgs[:1], [0.0])
-    kw = {"psf_library": library(dataset, imgs[:1])} if mode == "RDI" else {}
-    image, header = reduced(dataset, tmp_path, mode=mode, numbasis=1, **kw)[PRODUCT]
-    assert image.shape == (1, *SHAPE)
-    assert np.nanmax(image) == pytest.approx(1.85, rel=0.1)
-    assert header["DRSTAT"] == "CONVERGED"
-
-
-@pytest.mark.usefixtures("registered")
 def test_lite_and_double_precision_and_no_derotation(imgs, tmp_path):
     outputs = []
     for kw in ({}, {"lite": True}, {"dtype": ctypes.c_double}, {"skip_derot": True}):

@@ -15,14 +15,19 @@ from pyklip.instruments.JWST import JWSTData
 from pyklip.klip import high_pass_filter
 
 from pyklip_diffrender.errors import DiffrenderWarning
-from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, observation_from_dataset
+from pyklip_diffrender.pyklip_backend import (
+    DiffrenderSettings,
+    backend,
+    observation_from_dataset,
+    unregister,
+)
 
 NATIVE = (20.7, 25.2)
 MIDDLE = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning"),
-    pytest.mark.usefixtures("offline"),
+    pytest.mark.usefixtures("offline", "registered"),
 ]
 
 
@@ -48,6 +53,7 @@ def reduce(dataset, folder, **kw):
 
 
 def test_reading_is_the_same_and_the_reader_is_put_back(files, reference):
+    unregister()
     plain = JWSTData(files, reference)
     readdata = vars(JWSTData)["readdata"]
     with backend(opd=OPD):
@@ -62,7 +68,6 @@ def test_reading_is_the_same_and_the_reader_is_put_back(files, reference):
             np.testing.assert_array_equal(getattr(captured, name), value)
 
 
-@pytest.mark.usefixtures("registered")
 def test_the_fit_gets_recorded_pixels_errors_flags_and_headers(files, rng):
     dataset = JWSTData(files)
     observation = observation_from_dataset(copy.deepcopy(dataset))
@@ -92,6 +97,7 @@ def test_filters_are_fitted_one_by_one(tmp_path, rng, monkeypatch):
         seen.append((observation.filter, list(observation.position_angles), names))
         return render(observation, opd, settings)
 
+    unregister()
     in_place_of_fits(monkeypatch, subtract)
     paths, others = [], []
     for name in ("F356W", "F444W"):
@@ -115,7 +121,6 @@ def test_filters_are_fitted_one_by_one(tmp_path, rng, monkeypatch):
     assert np.nanmax(np.abs(cube)) < 0.02 * 1000
 
 
-@pytest.mark.usefixtures("registered")
 def test_center_keywords_and_dithers(tmp_path, rng):
     path = tmp_path / "a_calints.fits"
     calints(path, rng)
@@ -131,7 +136,6 @@ def test_center_keywords_and_dithers(tmp_path, rng):
         np.testing.assert_allclose(observation.center[0], expected)
 
 
-@pytest.mark.usefixtures("registered")
 def test_products_are_aligned_as_pyklip_aligns_and_keep_its_header(files, reference, tmp_path):
     runs = []
     options = {"save_ints": True, "time_collapse": "weighted-mean"}
@@ -154,7 +158,6 @@ def test_products_are_aligned_as_pyklip_aligns_and_keep_its_header(files, refere
     assert np.nanmax(np.abs(ours[0])) < 0.3
 
 
-@pytest.mark.usefixtures("registered")
 def test_companions_injected_after_reading_are_in_what_is_fitted_and_kept(files, tmp_path):
     dataset = JWSTData(files)
     copied = copy.deepcopy(dataset)
@@ -175,7 +178,6 @@ def test_companions_injected_after_reading_are_in_what_is_fitted_and_kept(files,
     assert made.subtraction.worst.result.valid.sum() == 4 * (clean[0].size - 2)
 
 
-@pytest.mark.usefixtures("registered")
 def test_a_pixel_masked_by_hand_is_not_fitted(files, tmp_path):
     dataset = JWSTData(files)
     dataset.input[0, 14, 12] = np.nan
@@ -189,7 +191,6 @@ def test_a_pixel_masked_by_hand_is_not_fitted(files, tmp_path):
     assert np.isfinite(dataset.output[0, 1, 0, 14, 12])
 
 
-@pytest.mark.usefixtures("registered")
 def test_a_changed_dataset_is_taken_as_it_is(files, tmp_path):
     dataset = JWSTData(files)
     dataset.pad_input(5)
@@ -205,6 +206,7 @@ def test_a_changed_dataset_is_taken_as_it_is(files, tmp_path):
 
 
 def test_a_dataset_read_before_registering_still_works(files, tmp_path):
+    unregister()
     dataset = JWSTData(files)
     with (
         backend(opd=OPD, subtractor=render),
@@ -223,7 +225,6 @@ def test_a_dataset_read_before_registering_still_works(files, tmp_path):
     np.testing.assert_allclose(late, early, atol=1e-3)
 
 
-@pytest.mark.usefixtures("registered")
 def test_frames_that_were_multiplied_after_reading(files, tmp_path):
     """The fit has the unit of the files, and the products that of the dataset."""
     expected, _ = reduce(JWSTData(files), tmp_path / "out")
@@ -241,7 +242,6 @@ def test_frames_that_were_multiplied_after_reading(files, tmp_path):
             np.testing.assert_allclose(image, 1e3 * expected, atol=2.0)
 
 
-@pytest.mark.usefixtures("registered")
 def test_frames_that_were_left_out_moved_or_filtered_after_reading(files):
     dataset = JWSTData(files)
     whole = observation_from_dataset(dataset)
@@ -264,7 +264,6 @@ def test_frames_that_were_left_out_moved_or_filtered_after_reading(files):
         observation_from_dataset(dataset)
 
 
-@pytest.mark.usefixtures("registered")
 def test_names_that_headers_cannot_hold(files, tmp_path):
     """Frames and wavefront map are called with letters that FITS does not have."""
     named = [
@@ -282,7 +281,6 @@ def test_names_that_headers_cannot_hold(files, tmp_path):
     assert dataset.filenames[0].startswith("β Pic größe 0")
 
 
-@pytest.mark.usefixtures("registered")
 def test_folders_in_the_prefix(files, tmp_path):
     out, dataset = tmp_path / "out", JWSTData(files)
     (out / "sub").mkdir(parents=True)
@@ -293,7 +291,6 @@ def test_folders_in_the_prefix(files, tmp_path):
         reduced(dataset, out, "none/star")
 
 
-@pytest.mark.usefixtures("registered")
 def test_files_without_errors_or_flags(tmp_path, rng):
     path = tmp_path / "a_calints.fits"
     calints(path, rng)
@@ -305,15 +302,3 @@ def test_files_without_errors_or_flags(tmp_path, rng):
     assert observation.valid.all()
     assert (observation.error > 0).all()
     np.testing.assert_array_equal(observation.data[0], science.data)
-
-
-def test_the_real_frames(shared_data, tmp_path):
-    path = shared_data / "hip65426_f444w_calints.fits.gz"
-    with backend(opd=OPD):
-        dataset = JWSTData([str(path)])
-        observation = observation_from_dataset(dataset)
-    assert observation.data.shape == (2, 320, 320)
-    np.testing.assert_allclose(observation.center, [[159.5, 158.5]] * 2)
-    np.testing.assert_array_equal(observation.data, fits.getdata(path, "SCI"))
-    assert observation.filter == "F444W"
-    assert observation.date.isot.startswith("2022-07-30")
