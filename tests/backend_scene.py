@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from astropy.io import fits
+from pyklip.parallelized import klip_dataset
 
 from pyklip_diffrender.pyklip_backend import Fit, Subtraction
 from pyklip_diffrender.wavefront import as_opd_map
@@ -13,6 +14,7 @@ CENTER = (21.25, 24.5)
 RIPPLE = 2e-9 * np.hypot(*np.mgrid[-32:32, -32:32])
 OPD = as_opd_map(RIPPLE)
 BACKGROUND = 3.0
+ANGLES = (0.0, 20.0, 45.0)
 
 
 def in_place_of_fits(monkeypatch, subtract):
@@ -20,6 +22,17 @@ def in_place_of_fits(monkeypatch, subtract):
     monkeypatch.setattr(
         "pyklip_diffrender.pyklip_backend.klip_call.subtract_by_refinement", subtract
     )
+
+
+def reduced(dataset, folder, prefix="x", **options):
+    """Run klip_dataset and give name -> (data, header) of all files it left."""
+    folder.mkdir(exist_ok=True)
+    options = {
+        "mode": "ADI", "annuli": 1, "subsections": 1, "numbasis": [1, 2], "movement": 0,
+        "numthreads": 1, "verbose": False, "algo": "diffrender", **options,
+    }  # fmt: skip
+    klip_dataset(dataset, outputdir=str(folder), fileprefix=prefix, **options)
+    return {path.name: fits.getdata(path, header=True) for path in sorted(folder.glob("*.fits"))}
 
 
 def psf(x, y, shape=SHAPE):

@@ -104,8 +104,7 @@ def shared_data():
     """Folder of real frames and wavefront maps, too large to come with the code.
 
     It is ``data`` in the folder named by PYKLIP_DIFFRENDER_SHARED, or in ``shared`` next to the
-    project. Without either, the tests that need it are skipped; a variable that points nowhere
-    is a mistake, and fails them.
+    project. Without either, the tests are skipped; a variable that points nowhere fails them.
     """
     named = os.environ.get("PYKLIP_DIFFRENDER_SHARED")
     data = (Path(named) if named else ROOT.parent / "shared") / "data"
@@ -126,14 +125,33 @@ def stpsf_path(tmp_path_factory):
         pytest.skip("needs stpsf, the extra 'webbpsf'")
     from stpsf_data import make_stpsf_data
 
-    before = os.environ.get("STPSF_PATH")
     folder = make_stpsf_data(tmp_path_factory.mktemp("stpsf") / "data", npix=256)
-    os.environ["STPSF_PATH"] = str(folder)
-    yield folder
-    if before is None:
-        del os.environ["STPSF_PATH"]
-    else:
-        os.environ["STPSF_PATH"] = before
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STPSF_PATH", str(folder))
+        yield folder
+
+
+@pytest.fixture
+def offline(monkeypatch):
+    """JWSTData asks a web service for its filters, and falls back to tables without."""
+    from pyklip.instruments import JWST
+
+    def refuse(**kw):
+        raise OSError("offline")
+
+    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", refuse)
+
+
+@pytest.fixture
+def registered():
+    """The backend in pyKLIP, with a subtractor that renders the star of `backend_scene`."""
+    from backend_scene import OPD, render
+
+    from pyklip_diffrender.pyklip_backend import register, unregister
+
+    register(opd=OPD, subtractor=render)
+    yield
+    unregister()
 
 
 @pytest.fixture

@@ -1,21 +1,30 @@
-"""The backend with a pipeline's own subclass of `Data`, and with pyKLIP's pools of processes."""
+"""The backend with a pipeline's own subclass of `Data`, in other threads, and in processes."""
 
 from __future__ import annotations
 
 import multiprocessing
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from astropy.io import fits
-from backend_scene import CENTER, OPD, SHAPE, frames, generic, psf, render
+from backend_scene import ANGLES, CENTER, OPD, SHAPE, frames, generic, psf, reduced, render
 from pyklip import rdi
 from pyklip.instruments.Instrument import Data
 from pyklip.instruments.utils import wcsgen
-from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend
-
-ANGLES = (0.0, 20.0, 45.0)
+from pyklip_diffrender.errors import DiffrenderWarning
+from pyklip_diffrender.pyklip_backend import (
+    DiffrenderSettings,
+    backend,
+    is_registered,
+    register,
+    unregister,
+)
+from pyklip_diffrender.pyklip_backend.child import spawned_beside_klip
 
 # pyKLIP 2.10 takes the mean of sections that are all NaN.
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
@@ -33,8 +42,7 @@ class PipelineData(Data):
     def __init__(self, images, references):
         super().__init__()
         self.readdata(images)
-        count = len(references)
-        names = [*self.filenames, *(f"reference_{k}.fits" for k in range(count))]
+        names = [*self.filenames, *(f"reference_{k}.fits" for k in range(len(references)))]
         self._psflib = rdi.PSFLibrary(
             np.array([*self.input, *references]), np.array(CENTER), names, compute_correlation=True
         )
@@ -53,9 +61,8 @@ class PipelineData(Data):
         self.flipx = False
 
     def savedata(
-        self, filepath, data, klipparams = None, filetype = "",
-        zaxis = None, more_keywords = None,
-    ):  # fmt: skip
+        self, filepath, data, klipparams=None, filetype="", zaxis=None, more_keywords=None
+    ):
         header = fits.Header({"PIPELINE": "ours", "PSFPARAM": klipparams, "FILETYPE": filetype})
         header["PSFCENTX"], header["PSFCENTY"] = self.output_centers[0]
         header.update({f"KLMODE{k}": mode for k, mode in enumerate(() if zaxis is None else zaxis)})
@@ -65,32 +72,26 @@ class PipelineData(Data):
         return img
 
 
-@pytest.mark.parametrize("mode", ["ADI", "RDI", "ADI+RDI"])
+@pytest.mark.parametrize("mode", ["ADI", "ADI+RDI"])
 def test_a_pipelines_own_dataset(mode, rng, tmp_path):
     images = frames(ANGLES, rng)
     star = 900 * psf(*CENTER) + rng.normal(0, 0.05, (4, *SHAPE))
     dataset = PipelineData(images, star)
     dataset.diffrender = DiffrenderSettings(opd=OPD, subtractor=render)
-    options = {
-        "annuli": 1, "subsections": 1, "movement": 1, "numbasis": [1, 4], "calibrate_flux": False,
-        "numthreads": 1, "verbose": False,
-    }  # fmt: skip
     with backend():
         # The algorithm is not the pipeline's to choose: it calls pyKLIP without `algo`.
-        klip_dataset(
-            dataset, outputdir=str(tmp_path), fileprefix="", mode=mode,
-            psf_library=dataset._psflib, **options,
+        files = reduced(
+            dataset, tmp_path, "", algo="klip", mode=mode, numbasis=[1, 4], movement=1,
+            calibrate_flux=False, psf_library=dataset._psflib,
         )  # fmt: skip
-    image, header = fits.getdata(tmp_path / "-KLmodes-all.fits", header=True)
+    image, header = files["-KLmodes-all.fits"]
     # The pipeline reads the product again and copies its cards, one by one.
     copied = fits.Header()
     for card in header.cards:
         copied.set(*card)
-    assert copied["PIPELINE"] == "ours"
-    assert copied["DRALGO"] == "diffrender"
+    assert (copied["PIPELINE"], copied["DRALGO"]) == ("ours", "diffrender")
     assert (copied["PSFCENTX"], copied["PSFCENTY"]) == tuple(dataset.output_centers[0])
-    combined = np.nanmean(dataset.output[:, :, 0], axis=1)
-    np.testing.assert_allclose(image, combined, rtol=1e-5)
+    np.testing.assert_allclose(image, np.nanmean(dataset.output[:, :, 0], axis=1), rtol=1e-5)
     # The companion is 12 pixels up, and nothing is left of the star of 1000.
     x, y = np.round(dataset.output_centers[0]).astype(int)
     assert image[0, y + 12, x] == pytest.approx(2.0, abs=0.3)
@@ -98,31 +99,100 @@ def test_a_pipelines_own_dataset(mode, rng, tmp_path):
     assert np.nanmax(abs(image)) < 0.5
 
 
-@pytest.fixture
-def start_method(request):
-    before = multiprocessing.get_start_method(allow_none=True)
-    multiprocessing.set_start_method(request.param, force=True)
-    yield request.param
-    multiprocessing.set_start_method(before, force=True)
-
-
 @pytest.mark.parametrize(
-    "start_method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)], indirect=True
+    ("method", "threads"), [("fork", 2), pytest.param("spawn", 1, marks=pytest.mark.slow)]
 )
-def test_the_start_method_of_processes_changes_nothing(start_method, rng, tmp_path):
+def test_the_start_method_of_processes_changes_nothing(method, threads, rng, tmp_path):
     """pyKLIP turns frames in a pool, and measures their noise in one for weighted means.
 
     Processes of a fork server know no more than those that are spawned.
     """
     images, cubes = frames(ANGLES, rng), []
-    for threads in (1, 2):
-        dataset = generic(images, ANGLES)
+    before = multiprocessing.get_start_method(allow_none=True)
+    for start, count in (("fork", 1), (method, threads)):
+        multiprocessing.set_start_method(start, force=True)
         with backend(opd=OPD, subtractor=render):
-            klip_dataset(
-                dataset, mode="ADI", annuli=2, subsections=1, movement=0, numbasis=[1],
-                outputdir=str(tmp_path), fileprefix="x", time_collapse="weighted-mean",
-                highpass=8.0, numthreads=threads, verbose=False, algo="diffrender",
+            files = reduced(
+                generic(images, ANGLES), tmp_path, annuli=2, numbasis=[1], highpass=8.0,
+                time_collapse="weighted-mean", numthreads=count,
             )  # fmt: skip
-        cubes.append(fits.getdata(tmp_path / "x-KLmodes-all.fits"))
+        cubes.append(files["x-KLmodes-all.fits"][0])
+    multiprocessing.set_start_method(before, force=True)
     assert np.isfinite(cubes[0]).any()
     np.testing.assert_array_equal(*cubes)
+
+
+# Calls in other threads and processes never run plain KLIP without a word.
+
+VARIABLE = "PYKLIP_DIFFRENDER_TAKES_KLIP"
+
+
+def call(rng, folder, algo):
+    """Run `klip_dataset` in another thread; returns what it raised."""
+    dataset = generic(frames([0.0, 30.0], rng), [0.0, 30.0])
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(reduced, dataset, folder, algo=algo, numbasis=[1]).exception()
+
+
+@pytest.mark.parametrize("algo", ["klip", "diffrender"])
+def test_a_block_of_another_thread_is_mentioned(algo, rng, tmp_path):
+    # Warnings are errors here, so that KLIP does not run.
+    with backend(opd=OPD, subtractor=render):
+        raised = call(rng, tmp_path, algo)
+    assert isinstance(raised, DiffrenderWarning)
+    assert "in this thread" in str(raised)
+
+
+def test_what_is_registered_holds_in_threads(rng, tmp_path):
+    register(opd=OPD, subtractor=render, replace=True)
+    raised = call(rng, tmp_path, "klip")
+    unregister()
+    assert raised is None
+    assert "DRALGO" in fits.getheader(tmp_path / "x-KLmodes-all.fits")
+
+
+def test_who_takes_calls_of_klip_is_in_the_environment(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    with backend(opd=OPD, force=False):
+        assert VARIABLE not in os.environ
+        with backend(opd=OPD):
+            assert os.environ[VARIABLE] == str(os.getpid())
+            assert not spawned_beside_klip()
+        assert VARIABLE not in os.environ
+    register(opd=OPD, replace=True)
+    assert VARIABLE in os.environ
+    unregister()
+    assert VARIABLE not in os.environ
+    assert not is_registered()
+
+
+SCRIPT = """
+import multiprocessing
+import warnings
+import pyklip_diffrender as dr
+
+def work(_):
+    from pyklip import parallelized
+    from pyklip_diffrender.pyklip_backend import is_registered
+    assert not is_registered()
+    warnings.simplefilter("error")
+    try:
+        parallelized.klip_dataset(None, algo="klip")
+    except UserWarning as warning:
+        return str(warning)
+
+if __name__ == "__main__":
+    with dr.backend(opd="flat"):
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            print(pool.map(work, [0])[0])
+"""
+
+
+@pytest.mark.slow
+def test_a_spawned_process_says_that_it_runs_klip(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=300
+    )
+    assert "runs KLIP in this spawned process" in done.stdout, done.stderr

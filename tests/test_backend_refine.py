@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from astropy.io import fits
+from backend_scene import reduced
 from pyklip.fakes import gaussfit2d
 from pyklip.instruments.Instrument import GenericData
 from pyklip.klip import rotate
-from pyklip.parallelized import klip_dataset
 from scipy.ndimage import map_coordinates
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError, RefinementError
@@ -83,45 +83,43 @@ def dataset(frames, model, **settings):
     """Frames padded with NaN as spaceKLIP does, and no header."""
     filled = padded(frames)
     center = ((SHAPE[1] - 1) / 2 + PAD, (SHAPE[0] - 1) / 2 + PAD)
+    count = len(frames)
     made = GenericData(
-        filled,
-        np.tile(center, (len(frames), 1)),
-        parangs=np.array(ANGLES[: len(frames)]),
-        wvs=np.full(len(frames), 4.44),
-        IWA=2,
-        filenames=np.array([f"roll{i}" for i in range(len(frames))]),
-    )
+        filled, np.tile(center, (count, 1)), parangs=np.array(ANGLES[:count]),
+        wvs=np.full(count, 4.44), IWA=2, filenames=np.array([f"roll{i}" for i in range(count)]),
+    )  # fmt: skip
     made.OWA = 40.0
     made.diffrender = DiffrenderSettings(
-        model=model,
-        **{
+        model=model, **{
             "error": np.sqrt(np.nan_to_num(np.abs(filled), nan=1.0)),
-            "fit": GaussNewton(basis=default_basis(6.0), response_npix=128),
-            **settings,
+            "fit": GaussNewton(basis=default_basis(6.0), response_npix=128), **settings,
         },
-    )
+    )  # fmt: skip
     return made
 
 
 def reduce(made, folder, algo="klip"):
-    klip_dataset(
-        made, mode="ADI", outputdir=str(folder), fileprefix="x", annuli=1, subsections=1,
-        numbasis=[1], movement=0, numthreads=1, verbose=False, algo=algo,
-        aligned_center=made.centers[0],
-    )  # fmt: skip
-    cube, header = fits.getdata(folder / "x-KLmodes-all.fits", header=True)
+    files = reduced(made, folder, algo=algo, numbasis=[1], aligned_center=made.centers[0])
+    cube, header = files["x-KLmodes-all.fits"]
     return cube[0].astype(np.float64), header
 
 
-@pytest.mark.slow
-def test_star_goes_companion_stays(small, frames, tmp_path):
-    made = dataset(frames, small)
+@pytest.fixture(scope="module")
+def refined(small, frames, tmp_path_factory):
+    """The frames reduced from an outdated wavefront: dataset, image, header, and throughput."""
+    made, folder = dataset(frames, small), tmp_path_factory.mktemp("refined")
     with backend(opd=OLD):
-        refined, outdated = copy.deepcopy(made), copy.deepcopy(made)
-        image, header = reduce(refined, tmp_path)
-        outdated.diffrender = replace(made.diffrender, fit=ALIGNED, max_chi2=np.inf)
-        with pytest.warns(DiffrenderWarning, match="roll0.*MODEL_MISMATCH.*What to do: .*filter"):
-            reduce(outdated, tmp_path)
+        image, header = reduce(made, folder)
+    return made, image, header, fits.getdata(folder / "x-throughput.fits", header=True)
+
+
+@pytest.mark.slow
+def test_star_goes_companion_stays(small, frames, refined, tmp_path):
+    made, image, header, _ = refined
+    outdated = dataset(frames, small, fit=ALIGNED, max_chi2=np.inf)
+    warned = pytest.warns(DiffrenderWarning, match="roll0.*MODEL_MISMATCH.*What to do: .*filter")
+    with backend(opd=OLD), warned:
+        reduce(outdated, tmp_path)
     x, y = made.centers[0]
     peak = np.unravel_index(np.nanargmax(image), image.shape)
     np.testing.assert_allclose(peak, (y + SEPARATION / 0.062424185, x), atol=1.0)
@@ -138,19 +136,17 @@ def test_star_goes_companion_stays(small, frames, tmp_path):
         pull = (found - star) / np.sqrt(star + SKY)
         return float(np.sqrt(np.mean(pull[6:-6, 4:-4] ** 2)))
 
-    assert wrong(refined) < 0.5 * wrong(outdated)
+    assert wrong(made) < 0.5 * wrong(outdated)
 
     # The fit saw 32 x 32 pixels, the product covers all that the frames hold.
     assert np.isfinite(image).sum() > 1.0 * frames[0].size
-    assert header["DRSTAT"] == "CONVERGED"
     # Both rolls share a fit.
-    assert header["DRNFIT"] == 1
-    (fit,) = refined.diffrender_results[0].subtraction.fits
+    assert (header["DRSTAT"], header["DRNFIT"]) == ("CONVERGED", 1)
+    (fit,) = made.diffrender_results[0].subtraction.fits
     assert fit.frames == (0, 1)
     assert header["DRCHI2"] == pytest.approx(fit.result.chi2_per_pixel)
     assert (header["DRSYST"], header["DRREFS"]) == ("none", 0)
-    assert header["DROPD"] == OLD.name
-    assert header["DRSHA256"] == OLD.sha256
+    assert (header["DROPD"], header["DRSHA256"]) == (OLD.name, OLD.sha256)
 
 
 @pytest.mark.slow
@@ -181,7 +177,7 @@ def test_what_is_detected_keeps_its_light(small, tmp_path):
     assert kept[True] == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize(("angle", "flipx"), [(0.0, False), (70.0, False), (-130.0, True)])
+@pytest.mark.parametrize(("angle", "flipx"), [(70.0, False), (-130.0, True)])
 def test_maps_are_turned_as_pyklip_turns_frames(angle, flipx):
     y, x = np.indices((40, 46))
     image = np.exp(-((x - 20) ** 2 + (y - 30) ** 2) / 200) + 0.01 * x
@@ -213,33 +209,28 @@ def test_a_companion_in_the_model_keeps_its_light(small, frames):
 
 
 @pytest.mark.slow
-def test_a_faint_planet_loses_what_the_throughput_map_says(small, frames, tmp_path):
+def test_a_faint_planet_loses_what_the_throughput_map_says(small, frames, refined, tmp_path):
     """The difference of two reductions, against the closed form; the planet is east of north."""
     camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
     light = np.array(
         [1e-7 * FLUX * camera(NEW, star_offset=planet_pixels(a, 70.0)).numpy() for a in ANGLES]
     )
-    images = {}
-    for name, shots, algo in (
-        ("without", frames, "klip"), ("with", frames + light, "klip"), ("light", light, "none"),
-    ):  # fmt: skip
-        made = dataset(shots, small, error=np.sqrt(np.nan_to_num(padded(frames), nan=1.0)))
-        with backend(opd=OLD):
-            images[name], header = reduce(made, tmp_path, algo=algo)
-        if name == "without":
-            left, about = fits.getdata(tmp_path / "x-throughput.fits", header=True)
-            assert header["DRTHRU"] == pytest.approx(np.nanmedian(left), abs=0.2)
-            assert about["DRTHRU"] == header["DRTHRU"]
-            np.testing.assert_array_equal(np.isnan(left), np.isnan(images[name]))
+    made, without, header, (left, about) = refined
+    assert header["DRTHRU"] == pytest.approx(np.nanmedian(left), abs=0.2)
+    assert about["DRTHRU"] == header["DRTHRU"]
+    np.testing.assert_array_equal(np.isnan(left), np.isnan(without))
+    error = made.diffrender.error
+    with backend(opd=OLD):
+        present, _ = reduce(dataset(frames + light, small, error=error), tmp_path)
+        alone, _ = reduce(dataset(light, small, error=error), tmp_path, algo="none")
     x, y = made.centers[0]
     turn = np.radians(70.0)
     x -= SEPARATION * np.sin(turn) / 0.062424185
     y += SEPARATION * np.cos(turn) / 0.062424185
-    change = images["with"] - images["without"]
     # As spaceKLIP measures injected sources, in units of their peak.
     peaks = [
-        gaussfit2d(image / np.nanmax(images["light"]), x, y, searchrad=5, guessfwhm=2.3)[0]
-        for image in (change, images["light"])
+        gaussfit2d(image / np.nanmax(alone), x, y, searchrad=5, guessfwhm=2.3)[0]
+        for image in (present - without, alone)
     ]
     kept = peaks[0] / peaks[1]
     assert 0.2 < kept < 0.9
@@ -312,14 +303,8 @@ def test_products_show_the_sky_of_all_rolls(image, small, frames, tmp_path):
     assert expected == pytest.approx(1.0, abs=0.25 * (image == "cleaned"))
 
 
-@pytest.mark.parametrize(
-    ("instrument", "keep", "kept"),
-    [("NIRCAM", None, True), ("NIRCAM", False, False), (None, None, False), (None, True, True)],
-)
-def test_companions_are_kept_by_default_in_real_frames_only(
-    instrument, keep, kept, small,
-    monkeypatch,
-):  # fmt: skip
+@pytest.mark.parametrize(("instrument", "kept"), [("NIRCAM", True), (None, False)])
+def test_companions_are_kept_by_default_in_real_frames_only(instrument, kept, small, monkeypatch):
     given_back = []
     monkeypatch.setattr(
         "pyklip_diffrender.pyklip_backend.subtract._give_back", lambda *args: given_back.append(1)
@@ -329,23 +314,18 @@ def test_companions_are_kept_by_default_in_real_frames_only(
     observation = Observation.from_arrays(
         star, np.sqrt(star), pixelscale=small.detector.pixelscale, header=header
     )
-    settings = DiffrenderSettings(model=small, fit=ALIGNED, keep_detected=keep)
-    subtract_by_refinement(observation, OLD, settings)
+    subtract_by_refinement(observation, OLD, DiffrenderSettings(model=small, fit=ALIGNED))
     assert bool(given_back) == kept
 
 
-@pytest.mark.parametrize("wrong", ["nothing", "centre", "filter"])
+@pytest.mark.parametrize("wrong", ["nothing", "filter"])
 def test_a_header_that_contradicts_the_data_stops_the_reduction(wrong, small, frames, tmp_path):
-    model, numerics = small, {**NUMERICS, "monochromatic": 3.56e-6}
+    model = small
+    expected = pytest.warns(DiffrenderWarning, match="MODEL_MISMATCH")
     if wrong == "filter":
-        model = nircam_coronagraph("F356W", fov_pixels=32, **numerics)
-    made = dataset(frames[:1], model, fit=ALIGNED)
-    if wrong == "centre":
-        made.centers = made.centers + 10.0
-    if wrong == "nothing":
-        expected = pytest.warns(DiffrenderWarning, match="MODEL_MISMATCH")
-    else:
+        model = nircam_coronagraph("F356W", fov_pixels=32, **NUMERICS | {"monochromatic": 3.56e-6})
         expected = pytest.raises(RefinementError, match=r"roll0: .* max_chi2=100: .*STARCENX.*filt")
+    made = dataset(frames[:1], model, fit=ALIGNED)
     with backend(opd=OLD), expected:
         reduce(made, tmp_path)
     assert bool(list(tmp_path.iterdir())) == (wrong == "nothing")
@@ -353,12 +333,8 @@ def test_a_header_that_contradicts_the_data_stops_the_reduction(wrong, small, fr
 
 def test_a_fit_that_diverges_stops_the_reduction(small, frames, tmp_path):
     made = dataset(-frames[:1], small)
-    with (
-        backend(opd=OLD, fit=ALIGNED),
-        pytest.raises(
-            RefinementError, match="roll0: the fit ended as DIVERGED: the fitted star has no"
-        ) as caught,
-    ):
+    refused = pytest.raises(RefinementError, match="roll0: the fit ended as DIVERGED: the fitted")
+    with backend(opd=OLD, fit=ALIGNED), refused as caught:
         reduce(made, tmp_path)
     assert caught.value.result.frames[0].star.shape == (32, 32)
     assert list(tmp_path.iterdir()) == []

@@ -8,10 +8,8 @@ disagrees, and if the phrase is gone.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -85,11 +83,6 @@ def planets(where, count):
     return [float(np.sum(found["value"])), count * len(found)]
 
 
-def all_planets():
-    beyond, within = planets("beyond", 24), planets("within", 4)
-    return [beyond[0] + within[0], beyond[1] + within[1]]
-
-
 def disk(setting, *bands):
     quantity = "disk's light that is kept"
     return [stated(quantity, filter=band, setting=setting) for band in bands]
@@ -146,212 +139,172 @@ def experiments(method):
     return [medians[0], float(np.median(ratio)), medians[1]]
 
 
-def speed(row, column, what):
-    (found,) = (
-        each for each in rows("performance", row=row, precision="float64")
-        if str(each["column"]) == column
-    )  # fmt: skip
-    return float(found[what])
+def speeds(row, ours, others, error, scale=1.0, others_scale=1.0):
+    """Duration and error of ours and of another's, and how many times as fast ours is."""
+    found = {
+        str(each["column"]): each for each in rows("performance", row=row, precision="float64")
+    }
+    one, other = found[ours], found[others]
+    times = [scale * one["seconds"], others_scale * other["seconds"]]
+    return [times[0], one[error], times[1], other[error], one["ratio"]]
 
 
-class Claim(NamedTuple):
-    """A phrase of a document, with a format for each number, and where the numbers come from."""
-
-    document: str
-    phrase: str
-    numbers: Callable[[], Sequence[float]]
+@cache
+def claims():
+    """Document, phrase with a format for each number, and the numbers, of every claim."""
+    return tuple(_claims())
 
 
 BOTH = ("F444W", "F356W")
 LIMITS, IMAGES, DISKS = "real_pairs_limits", "real_pairs_images", "disk_limits"
-PAGE = "docs/validation/real_frames.md"
+README, PAPER, PAGE = "README.md", "paper/paper.md", "docs/validation/real_frames.md"
+HOWTO, RESOURCES = "docs/howto/real_frames.md", "docs/howto/resources.md"
+CALIBRATION, DEMO = "docs/validation/calibration.md", "docs/validation/demo.md"
+SPEED = "docs/validation/speed_error.md"
 
-CLAIMS = (
-    # -- README
-    Claim("README.md", "has S/N {:.1f} and a contrast of {:.2f}e-6 +- {:.2f}e-6.",
-          lambda: [stated("demo: S/N"), 1e6 * stated("demo: contrast"),
-                   1e6 * stated("demo: contrast", "error")]),
-    Claim("README.md", "Its annulus SNR is {:.1f}, with KLIP and nine reference frames {:.1f}.",
-          lambda: [stated("demo: annulus SNR", setting=each) for each in ("refined", "KLIP")]),
-    Claim("README.md", "{:.1f} and {:.1f} times for HIP 17695, {:.1f} and {:.1f} times for G 7-34",
-          lambda: [*medians(LIMITS, "ratio", "HIP 17695", *BOTH),
-                   *medians(LIMITS, "ratio", "G 7-34", *BOTH)]),
-    Claim("README.md", "KLIP is up to {:.1f} times deeper within 0.7 arcsec",
-          lambda: [1 / least(LIMITS, "ratio", star="G 7-34", filter="F444W")]),
-    Claim("README.md", "Fluxes of {:.0f} injected planets are {:.2f} +- {:.2f} of the truth",
-          lambda: [all_planets()[1],
-                   *(stated("injected planets: contrast over truth, mean", each, star="all")
-                     for each in ("value", "error"))]),
-    Claim("README.md", "{:.0f} of {:.0f} are detected beyond 0.45 arcsec, and {:.0f} of {:.0f}",
-          lambda: [*planets("beyond", 24), *planets("within", 4)]),
-    Claim("README.md", "one likelihood have median limits {:.2f} and {:.2f} times deeper than KLIP",
-          lambda: [middle("reference_sequences", "klip_over_ours_raw", visit=k) for k in (0, 1)]),
-    Claim("README.md", "At single separations KLIP is up to {:.2f} times deeper.",
-          lambda: [1 / min(least("reference_sequences", "klip_over_ours_raw", visit=k)
-                           for k in (0, 1))]),
-    Claim("README.md", "median limits are {:.1f} to {:.1f} times deeper than KLIP's (ADI+RDI)",
-          lambda: [f(of_pairs(IMAGES, "ratio")[::2]) for f in (min, max)]),
-    Claim("README.md", "separation from 0.4 to 2.3 arcsec at least {:.1f} times.",
-          lambda: [min(of_pairs(IMAGES, "ratio"))]),
-    Claim("README.md", "Beside AU Mic's disk they are {:.1f} and {:.1f} times",
-          lambda: [stated("ratio of limits of product images, median", filter=band,
-                          setting="cleaned") for band in BOTH]),
-    Claim("README.md", "KLIP's are up to {:.1f} and {:.1f} times deeper.",
-          lambda: [1 / stated("ratio of limits of product images, smallest", filter=band,
-                              setting="cleaned") for band in BOTH]),
-    Claim("README.md", "KLIP keeps {:.0f} to {:.0f} % of the light, and `disk=True` {:.0f} %",
-          lambda: [100 * of_klip(min), 100 * of_klip(max),
-                   *(100 * each for each in disk("disk=True, fitted light", "F444W"))]),
-    Claim("README.md", "(F444W) and {:.0f} % (F356W)",
-          lambda: [100 * each for each in disk("disk=True, fitted light", "F356W")]),
-    Claim("README.md", "at S/N {:.0f} and {:.3f} +- {:.3f} arcsec (published: {:.3f} +- {:.3f})",
-          lambda: [stated("S/N of the companion"), *companion("separation of the companion"),
-                   *companion("published separation")]),
-    Claim("README.md", "a contrast of {:.2f}e-4 +- {:.2f}e-4 (published: {:.2f}e-4 +- {:.2f}e-4)",
-          lambda: [*companion("contrast of the companion", 1e4),
-                   *companion("published contrast", 1e4)]),
-    # -- intake
-    Claim("docs/howto/real_frames.md", "segments), {:.0f} are used entirely, from {:.0f} "
-          "some files are excluded with a reason, and {:.0f} are refused",
-          lambda: [float(table("intake")[name][-1])
-                   for name in ("as untouched", "excluded", "refused")]),
-    # -- resources
-    Claim("docs/howto/resources.md", "3255 integrations, takes {:.2f} times its size",
-          lambda: [stated("memory of reading over the size of the file", setting="4 GB")]),
-    Claim("docs/howto/resources.md", "reading takes {:.1f} times the file (`--dataset",
-          lambda: [stated("memory of reading over the size of the file",
-                          setting="pyKLIP dataset, 0.2 GB")]),
-    # -- paper
-    Claim("paper/paper.md", "factors of {:.1f} (F356W) and {:.1f} (F444W) for HIP 17695, "
-          "and of {:.1f} and {:.1f} for G 7-34",
-          lambda: [*medians(LIMITS, "ratio_small_sample", "HIP 17695", "F356W", "F444W"),
-                   *medians(LIMITS, "ratio_small_sample", "G 7-34", "F356W", "F444W")]),
-    Claim("paper/paper.md", "Of {1:.0f} planets injected at 1.6 times the limits {0:.0f} were",
-          all_planets),
-    Claim("paper/paper.md", "with fluxes of {:.2f} +- {:.2f} of the truth",
-          lambda: [stated("injected planets: contrast over truth, mean", each, star="all")
-                   for each in ("value", "error")]),
-    Claim("paper/paper.md", "KLIP keeps {:.0f} to {:.0f} % of the light and the joint fit {:.0f} % "
-          "in F444W ({:.0f} % in F356W)",
-          lambda: [100 * of_klip(min), 100 * of_klip(max),
-                   *(100 * each for each in disk("disk=True, fitted light", *BOTH))]),
-    Claim("paper/paper.md", "{:.3f} +- {:.3f} arcsec and a contrast of {:.2f}e-4 +- {:.2f}e-4",
-          lambda: [*companion("separation of the companion"),
-                   *companion("contrast of the companion", 1e4)]),
-    Claim("paper/paper.md", "published {:.3f} +- {:.3f} arcsec and {:.2f}e-4 +- {:.2f}e-4",
-          lambda: [*companion("published separation"), *companion("published contrast", 1e4)]),
-    # -- real frames
-    *(
-        Claim(PAGE, f"| {star}, {band} | {{:.2f}} ({{:.2f}}) | {{:.2f}} ({{:.2f}}) "
-              "| {:.2f} ({:.2f}) |", partial(ratios, star, band))
-        for star, band in PAIRS
-    ),
-    Claim(PAGE, "the S/N scatters by {:.2f} to {:.2f}.",
-          lambda: [stated(f"S/N deviation beyond 0.3 arcsec, {each}", setting="two rolls")
-                   for each in ("smallest", "largest")]),
-    Claim(PAGE, "F444W are {:.1f} to {:.1f} times higher.",
-          lambda: [stated(f"limits without a pattern over those with it, {each}")
-                   for each in ("smallest", "largest")]),
-    Claim(PAGE, "Of {1:.0f} planets, {0:.0f} are detected:", all_planets),
-    Claim(PAGE, "{:.0f} of {:.0f} beyond 0.45 arcsec, and {:.0f} of {:.0f} within",
-          lambda: [*planets("beyond", 24), *planets("within", 4)]),
-    Claim(PAGE, "contrasts are {:.2f} +- {:.2f} of the truth",
-          lambda: [stated("injected planets: contrast over truth, mean", each, star="all")
-                   for each in ("value", "error")]),
-    Claim(PAGE, "the median ratios are {:.2f} and {:.2f} in the two filters.",
-          lambda: [stated("ratio of limits of product images, median", filter=band,
-                          setting="cleaned") for band in BOTH]),
-    Claim(PAGE, "at 2 arcsec the ratios are {:.2f} and {:.2f}.",
-          lambda: [stated("ratio of limits of product images, at 2.0 arcsec", filter=band,
-                          setting="cleaned") for band in BOTH]),
-    Claim(PAGE, "in F356W it comes out {:.2f} times as large",
-          lambda: [stated("factor by which contrasts are too low without a map")]),
-    Claim(PAGE, "keeps {:.2f} and {:.2f} of it.",
-          lambda: disk("disk=True, fitted light", *BOTH)),
-    Claim(PAGE, "KLIP keeps {:.2f} and {:.2f} with one mode, and {:.2f} and {:.2f} with five.",
-          lambda: [*disk("KLIP, 1 modes", *BOTH), *disk("KLIP, 5 modes", *BOTH)]),
-    Claim(PAGE, "are {:.2f} and {:.2f} times deeper than KLIP's",
-          lambda: medians(DISKS, "ratio_small_sample", "AU Mic", *BOTH)),
-    Claim(PAGE, "the {:.0f} % and {:.0f} % of the field",
-          lambda: [stated("field with limits", filter=band) for band in BOTH]),
-    Claim(PAGE, "chi-squared per pixel of {:.1f} and {:.1f}.",
-          lambda: [stated("chi-squared per pixel", star="AU Mic", filter=band, setting="disk=True")
-                   for band in BOTH]),
-    Claim(PAGE, "is the only candidate, at S/N {:.0f}:", lambda: [stated("S/N of the companion")]),
-    Claim(PAGE, "| this package | {:.4f} +- {:.4f} | {:.2f}e-4 +- {:.2f}e-4 |",
-          lambda: [*companion("separation of the companion"),
-                   *companion("contrast of the companion", 1e4)]),
-    Claim(PAGE, "L20) | {:.3f} +- {:.3f} | {:.2f}e-4 +- {:.2f}e-4 |",
-          lambda: [*companion("published separation"),
-                   *companion("published contrast", 1e4)]),
-    # -- other pages
-    Claim("docs/howto/real_frames.md", "takes about twice as long",
-          lambda: [stated("duration without a map over that with a map")]),
-    *(
-        Claim("docs/validation/calibration.md", f"| {hours} | {{:.3f}} | {{:.3f}} | {{:.3f}} |",
-              partial(calibration, hours))
-        for hours in (0, 3, 40, 86, 200)
-    ),
-    Claim("docs/validation/calibration.md",
-          "| 5-sigma limit | {:.3f} +- {:.3f} | {:+.2f} +- {:.2f} "
-          "| {:.2f} | {:.2f} |", lambda: fluxes(True)),
-    Claim("docs/validation/calibration.md", "| 1e-6 | {:.3f} +- {:.3f} | {:+.2f} +- {:.2f} "
-          "| {:.2f} | {:.2f} |", lambda: fluxes(False, 1e-6)),
-    Claim("docs/validation/calibration.md", "| 1e-4 | {:.4f} +- {:.4f} | {:+.2f} +- {:.2f} "
-          "| {:.2f} | {:.2f} |", lambda: fluxes(False, 1e-4)),
-    Claim("docs/validation/calibration.md", "| all 25 frames | {:.4f} +- {:.4f} | {:+.2f} +- "
-          "{:.2f} | {:.2f} | {:.2f} |", lambda: fluxes(False)),
-    Claim("docs/validation/calibration.md", "to {:.2f} mas, {:.4f} %, {:.4f} degrees and {:.2f} %",
-          lambda: [float(np.max(table("mismatch_measured")[f"{name}_error_{unit}"]))
-                   for name, unit in (("offset", "mas"), ("lyot", "percent"),
-                                      ("rotation", "deg"), ("flux", "percent"))]),
-    *(
-        Claim("docs/validation/experiments.md", f"| {name} | {{:.1f}} | {{:.2f}} | {{:.2f}} |",
-              partial(experiments, name))
-        for name in ("KLIP", "KLIP, library", "Adam", "Gauss-Newton", "marginalised")
-    ),
-    Claim("docs/validation/demo.md", "| KLIP | {:.1f} | {:.2f} | {:.1f} |",
-          lambda: [stated(f"demo: {each}", setting="KLIP")
-                   for each in ("annulus SNR", "throughput", "star error")]),
-    Claim("docs/validation/demo.md", "| refined: fitted to the frame | {:.1f} | {:.2f} | {:.2f} |",
-          lambda: [stated(f"demo: {each}", setting="refined")
-                   for each in ("annulus SNR", "throughput", "star error")]),
-    Claim("docs/validation/demo.md", "at {:.3f} arcsec and {:.1f} degrees",
-          lambda: [stated("demo: separation"), stated("demo: position angle")]),
-    Claim("docs/validation/demo.md", "a contrast of {:.2f}e-6 +- {:.2f}e-6 (true: 1e-6) at "
-          "S/N {:.1f}",
-          lambda: [1e6 * stated("demo: contrast"), 1e6 * stated("demo: contrast", "error"),
-                   stated("demo: S/N")]),
-    Claim("docs/validation/speed_error.md", "| one image | {:.1f} ms | {:.1e} of the peak | "
-          "{:.2f} s: stpsf `calc_psf`, oversample 4 | {:.1e} | {:.0f} |",
-          lambda: [1e3 * speed("forward", "this package, 1024", "seconds"),
-                   speed("forward", "this package, 1024", "error"),
-                   speed("forward", "stpsf calc_psf, fft_oversample 4", "seconds"),
-                   speed("forward", "stpsf calc_psf, fft_oversample 4", "error"),
-                   speed("forward", "this package, 1024", "ratio")]),
-    Claim("docs/validation/speed_error.md", "| image and gradient | {:.1f} ms | {:.1e} | "
-          "{:.0f} ms: the paper's renderer | {:.1e} | {:.0f} |",
-          lambda: [1e3 * speed("forward + backward", "this package, 1024", "seconds"),
-                   speed("forward + backward", "this package, 1024", "error"),
-                   1e3 * speed("forward + backward", "the paper's recipe", "seconds"),
-                   speed("forward + backward", "the paper's recipe", "error"),
-                   speed("forward + backward", "this package, 1024", "ratio")]),
-    Claim("docs/validation/speed_error.md", "| fit of a frame | {:.2f} s | star {:.2f} sigma | "
-          "{:.0f} s (one step timed): the paper's recipe, 1000 Adam steps | star {:.1f} sigma | "
-          "{:.0f} |",
-          lambda: [speed("refinement", "this package, as it comes", "seconds"),
-                   speed("refinement", "this package, as it comes", "sigma"),
-                   speed("refinement", "the paper's recipe, 1000 Adam steps", "seconds"),
-                   speed("refinement", "the paper's recipe, 1000 Adam steps", "sigma"),
-                   speed("refinement", "this package, as it comes", "ratio")]),
-    Claim("docs/validation/speed_error.md", "| S/N map, 6400 positions | {:.2f} s | "
-          "{:.0e} of S/N | {:.0f} s (two positions timed): "
-          "one call of the fine model for each position | | {:.0f} |",
-          lambda: [speed("S/N map", "this package, 6400 positions", "seconds"),
-                   speed("S/N map", "this package, 6400 positions", "error"),
-                   speed("S/N map", "one call of the fine model a position", "seconds"),
-                   speed("S/N map", "this package, 6400 positions", "ratio")]),
-)  # fmt: skip
+
+def _claims():
+    hip = [*companion("separation of the companion"),
+           *companion("contrast of the companion", 1e4)]  # fmt: skip
+    published = [*companion("published separation"), *companion("published contrast", 1e4)]
+    beyond, within = planets("beyond", 24), planets("within", 4)
+    found, injected = np.add(beyond, within)
+    truth = [stated("injected planets: contrast over truth, mean", each, star="all")
+             for each in ("value", "error")]  # fmt: skip
+    joint = [100 * each for each in disk("disk=True, fitted light", *BOTH)]
+    klip = [100 * of_klip(min), 100 * of_klip(max)]
+    cleaned = [stated("ratio of limits of product images, median", filter=band, setting="cleaned")
+               for band in BOTH]  # fmt: skip
+    demo = [1e6 * stated("demo: contrast"), 1e6 * stated("demo: contrast", "error")]
+    snr = stated("S/N of the companion")
+    visits = [{"visit": k} for k in (0, 1)]
+    ours, pages = "klip_over_ours_raw", of_pairs(IMAGES, "ratio")
+    yield from (
+        (README, "has S/N {:.1f} and a contrast of {:.2f}e-6 +- {:.2f}e-6.",
+         [stated("demo: S/N"), *demo]),
+        (README, "Its annulus SNR is {:.1f}, with KLIP and nine reference frames {:.1f}.",
+         [stated("demo: annulus SNR", setting=each) for each in ("refined", "KLIP")]),
+        (README, "{:.1f} and {:.1f} times for HIP 17695, {:.1f} and {:.1f} times for G 7-34",
+         [*medians(LIMITS, "ratio", "HIP 17695", *BOTH),
+          *medians(LIMITS, "ratio", "G 7-34", *BOTH)]),
+        (README, "KLIP is up to {:.1f} times deeper within 0.7 arcsec",
+         [1 / least(LIMITS, "ratio", star="G 7-34", filter="F444W")]),
+        (README, "Fluxes of {:.0f} injected planets are {:.2f} +- {:.2f} of the truth",
+         [injected, *truth]),
+        (README, "{:.0f} of {:.0f} are detected beyond 0.45 arcsec, and {:.0f} of {:.0f}",
+         [*beyond, *within]),
+        (README, "one likelihood have median limits {:.2f} and {:.2f} times deeper than KLIP",
+         [middle("reference_sequences", ours, **each) for each in visits]),
+        (README, "At single separations KLIP is up to {:.2f} times deeper.",
+         [1 / min(least("reference_sequences", ours, **each) for each in visits)]),
+        (README, "median limits are {:.1f} to {:.1f} times deeper than KLIP's (ADI+RDI)",
+         [min(pages[::2]), max(pages[::2])]),
+        (README, "separation from 0.4 to 2.3 arcsec at least {:.1f} times.", [min(pages)]),
+        (README, "Beside AU Mic's disk they are {:.1f} and {:.1f} times", cleaned),
+        (README, "KLIP's are up to {:.1f} and {:.1f} times deeper.",
+         [1 / stated("ratio of limits of product images, smallest", filter=band, setting="cleaned")
+          for band in BOTH]),
+        (README, "KLIP keeps {:.0f} to {:.0f} % of the light, and `disk=True` {:.0f} %",
+         [*klip, joint[0]]),
+        (README, "(F444W) and {:.0f} % (F356W)", joint[1:]),
+        (README, "at S/N {:.0f} and {:.3f} +- {:.3f} arcsec (published: {:.3f} +- {:.3f})",
+         [snr, *hip[:2], *published[:2]]),
+        (README, "a contrast of {:.2f}e-4 +- {:.2f}e-4 (published: {:.2f}e-4 +- {:.2f}e-4)",
+         [*hip[2:], *published[2:]]),
+        # -- intake and resources
+        (HOWTO, "segments), {:.0f} are used entirely, from {:.0f} some files are excluded with a "
+         "reason, and {:.0f} are refused",
+         [table("intake")[name][-1] for name in ("as untouched", "excluded", "refused")]),
+        (HOWTO, "takes about twice as long",
+         [stated("duration without a map over that with a map")]),
+        (RESOURCES, "3255 integrations, takes {:.2f} times its size",
+         [stated("memory of reading over the size of the file", setting="4 GB")]),
+        (RESOURCES, "reading takes {:.1f} times the file (`--dataset",
+         [stated("memory of reading over the size of the file", setting="pyKLIP dataset, 0.2 GB")]),
+        # -- paper
+        (PAPER, "factors of {:.1f} (F356W) and {:.1f} (F444W) for HIP 17695, and of {:.1f} and "
+         "{:.1f} for G 7-34",
+         [*medians(LIMITS, "ratio_small_sample", "HIP 17695", *BOTH[::-1]),
+          *medians(LIMITS, "ratio_small_sample", "G 7-34", *BOTH[::-1])]),
+        (PAPER, "Of {1:.0f} planets injected at 1.6 times the limits {0:.0f} were",
+         [found, injected]),
+        (PAPER, "with fluxes of {:.2f} +- {:.2f} of the truth", truth),
+        (PAPER, "KLIP keeps {:.0f} to {:.0f} % of the light and the joint fit {:.0f} % in F444W "
+         "({:.0f} % in F356W)", [*klip, *joint]),
+        (PAPER, "{:.3f} +- {:.3f} arcsec and a contrast of {:.2f}e-4 +- {:.2f}e-4", hip),
+        (PAPER, "published {:.3f} +- {:.3f} arcsec and {:.2f}e-4 +- {:.2f}e-4", published),
+        # -- real frames
+        *((PAGE, f"| {star}, {band} | {{:.2f}} ({{:.2f}}) | {{:.2f}} ({{:.2f}}) | {{:.2f}} "
+           "({:.2f}) |", ratios(star, band)) for star, band in PAIRS),
+        (PAGE, "the S/N scatters by {:.2f} to {:.2f}.",
+         [stated(f"S/N deviation beyond 0.3 arcsec, {each}", setting="two rolls")
+          for each in ("smallest", "largest")]),
+        (PAGE, "F444W are {:.1f} to {:.1f} times higher.",
+         [stated(f"limits without a pattern over those with it, {each}")
+          for each in ("smallest", "largest")]),
+        (PAGE, "Of {1:.0f} planets, {0:.0f} are detected:", [found, injected]),
+        (PAGE, "{:.0f} of {:.0f} beyond 0.45 arcsec, and {:.0f} of {:.0f} within",
+         [*beyond, *within]),
+        (PAGE, "contrasts are {:.2f} +- {:.2f} of the truth", truth),
+        (PAGE, "the median ratios are {:.2f} and {:.2f} in the two filters.", cleaned),
+        (PAGE, "at 2 arcsec the ratios are {:.2f} and {:.2f}.",
+         [stated("ratio of limits of product images, at 2.0 arcsec", filter=band,
+                 setting="cleaned") for band in BOTH]),
+        (PAGE, "in F356W it comes out {:.2f} times as large",
+         [stated("factor by which contrasts are too low without a map")]),
+        (PAGE, "keeps {:.2f} and {:.2f} of it.", disk("disk=True, fitted light", *BOTH)),
+        (PAGE, "KLIP keeps {:.2f} and {:.2f} with one mode, and {:.2f} and {:.2f} with five.",
+         [*disk("KLIP, 1 modes", *BOTH), *disk("KLIP, 5 modes", *BOTH)]),
+        (PAGE, "are {:.2f} and {:.2f} times deeper than KLIP's",
+         medians(DISKS, "ratio_small_sample", "AU Mic", *BOTH)),
+        (PAGE, "the {:.0f} % and {:.0f} % of the field",
+         [stated("field with limits", filter=band) for band in BOTH]),
+        (PAGE, "chi-squared per pixel of {:.1f} and {:.1f}.",
+         [stated("chi-squared per pixel", star="AU Mic", filter=band, setting="disk=True")
+          for band in BOTH]),
+        (PAGE, "is the only candidate, at S/N {:.0f}:", [snr]),
+        (PAGE, "| this package | {:.4f} +- {:.4f} | {:.2f}e-4 +- {:.2f}e-4 |", hip),
+        (PAGE, "L20) | {:.3f} +- {:.3f} | {:.2f}e-4 +- {:.2f}e-4 |", published),
+        # -- other pages
+        *((CALIBRATION, f"| {hours} | {{:.3f}} | {{:.3f}} | {{:.3f}} |", calibration(hours))
+          for hours in (0, 3, 40, 86, 200)),
+        *((CALIBRATION, f"| {name} | {{:{form}f}} +- {{:{form}f}} | {{:+.2f}} +- {{:.2f}} "
+           "| {:.2f} | {:.2f} |", fluxes(*which))
+          for name, form, which in (
+              ("5-sigma limit", ".3", (True,)), ("1e-6", ".3", (False, 1e-6)),
+              ("1e-4", ".4", (False, 1e-4)), ("all 25 frames", ".4", (False,)))),
+        (CALIBRATION, "to {:.2f} mas, {:.4f} %, {:.4f} degrees and {:.2f} %",
+         [np.max(table("mismatch_measured")[f"{name}_error_{unit}"])
+          for name, unit in (("offset", "mas"), ("lyot", "percent"), ("rotation", "deg"),
+                             ("flux", "percent"))]),
+        *(("docs/validation/experiments.md", f"| {name} | {{:.1f}} | {{:.2f}} | {{:.2f}} |",
+           experiments(name))
+          for name in ("KLIP", "KLIP, library", "Adam", "Gauss-Newton", "marginalised")),
+        *((DEMO, f"| {row} | {{:.1f}} | {{:.2f}} | {{:{form}f}} |",
+           [stated(f"demo: {each}", setting=setting)
+            for each in ("annulus SNR", "throughput", "star error")])
+          for row, form, setting in (("KLIP", ".1", "KLIP"),
+                                     ("refined: fitted to the frame", ".2", "refined"))),
+        (DEMO, "at {:.3f} arcsec and {:.1f} degrees",
+         [stated("demo: separation"), stated("demo: position angle")]),
+        (DEMO, "a contrast of {:.2f}e-6 +- {:.2f}e-6 (true: 1e-6) at S/N {:.1f}",
+         [*demo, stated("demo: S/N")]),
+        (SPEED, "| one image | {:.1f} ms | {:.1e} of the peak | {:.2f} s: stpsf `calc_psf`, "
+         "oversample 4 | {:.1e} | {:.0f} |",
+         speeds("forward", "this package, 1024", "stpsf calc_psf, fft_oversample 4", "error", 1e3)),
+        (SPEED, "| image and gradient | {:.1f} ms | {:.1e} | {:.0f} ms: the paper's renderer | "
+         "{:.1e} | {:.0f} |",
+         speeds("forward + backward", "this package, 1024", "the paper's recipe", "error", 1e3,
+                1e3)),
+        (SPEED, "| fit of a frame | {:.2f} s | star {:.2f} sigma | {:.0f} s (one step timed): the "
+         "paper's recipe, 1000 Adam steps | star {:.1f} sigma | {:.0f} |",
+         speeds("refinement", "this package, as it comes", "the paper's recipe, 1000 Adam steps",
+                "sigma")),
+        (SPEED, "| S/N map, 6400 positions | {0:.2f} s | {1:.0e} of S/N | {2:.0f} s (two positions "
+         "timed): one call of the fine model for each position | | {4:.0f} |",
+         speeds("S/N map", "this package, 6400 positions", "one call of the fine model a position",
+                "error")),
+    )  # fmt: skip
 
 
 def plain(text):
@@ -364,11 +317,18 @@ def powers(text):
     return re.sub(r"e-0(\d)", r"e-\1", text)
 
 
-@pytest.mark.parametrize("claim", CLAIMS, ids=lambda each: f"{each.document}: {each.phrase[:40]}")
-def test_a_claim_is_what_the_table_says(claim):
-    text = plain((ROOT / claim.document).read_text(encoding="utf-8"))
-    phrase = plain(powers(claim.phrase.format(*claim.numbers())))
-    assert phrase in text, f"{claim.document} does not say: {phrase}"
+def as_stated(phrase, numbers):
+    return plain(powers(phrase.format(*numbers)))
+
+
+@cache
+def text_of(document):
+    return plain((ROOT / document).read_text(encoding="utf-8"))
+
+
+def test_a_claim_is_what_the_table_says():
+    said = [(document, as_stated(phrase, numbers)) for document, phrase, numbers in claims()]
+    assert [each for each in said if each[1] not in text_of(each[0])] == []
 
 
 SETTINGS = (
@@ -386,12 +346,10 @@ SETTINGS = (
 )
 def test_results_of_readme_and_paper_are_all_claims(document, begin, end):
     """A number that is in no claim could disagree with the tables."""
-    text = plain(
-        (ROOT / document).read_text(encoding="utf-8").partition(begin)[2].partition(end)[0]
-    )
-    for claim in CLAIMS:
-        if claim.document == document:
-            text = text.replace(plain(powers(claim.phrase.format(*claim.numbers()))), "")
+    text = text_of(document).partition(begin)[2].partition(end)[0]
+    for where, phrase, numbers in claims():
+        if where == document:
+            text = text.replace(as_stated(phrase, numbers), "")
     for pattern in SETTINGS:
         text = re.sub(pattern, "", text)
     left = re.findall(r"[^ ]*\d[^ ]*", text)
@@ -413,14 +371,6 @@ def test_how_often_real_frames_are_not_explained():
     phrase = f"{missed} of the {len(PAIRS) + len(others)} reductions"
     assert phrase in advice(Status.MODEL_MISMATCH, patterned=True)
     assert phrase in (ROOT / "docs/howto/status.md").read_text(encoding="utf-8")
-
-
-def test_the_page_of_real_frames_has_few_numbers():
-    text = (ROOT / PAGE).read_text(encoding="utf-8")
-    for pattern in SETTINGS[:2]:
-        text = re.sub(pattern, "", text)
-    numbers = re.findall(r"(?<![\w.])\d[\d.]*(?:e-?\d+)?", text)
-    assert 60 < len(numbers) <= 120
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*.ecsv")), ids=lambda path: path.name)

@@ -1,20 +1,22 @@
-"""The command line: what it writes, where errors go, and that it starts quickly."""
+"""The command line: what it writes, what it refuses before any work, and where errors go."""
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import re
 import shutil
+import sys
 import tomllib
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,12 +25,18 @@ from astropy.io import fits
 from small_files import calints
 from synthetic_searches import searched, write_searched
 
-from pyklip_diffrender.cli import application, main
-from pyklip_diffrender.cli.session import read_config
-from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
+from pyklip_diffrender.cli import main
+from pyklip_diffrender.cli.session import Run
+from pyklip_diffrender.errors import (
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    MissingOPDError,
+    RefinementError,
+)
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.reduction import UNFINISHED, Preparation, ProductFolder, ReduceOptions
+from pyklip_diffrender.surveys import execution
 from pyklip_diffrender.wavefront.opd import random_opd, resample
 
 # The package has the command under the name of its module.
@@ -37,10 +45,6 @@ doctor = import_module("pyklip_diffrender.cli.application")
 PYTHON = re.compile(r"\w=|\bu\.\w|np\.|\w\(\)|[a-z]_[a-z]+:|=\.\.\.|\ba[n]? [A-Z][a-z]+[A-Z]")
 """Signs of Python in a message."""
 
-ROOT = Path(__file__).resolve().parents[1]
-
-WAVELENGTH = ["--monochromatic", "4.5e-6"]
-
 
 @lru_cache(maxsize=1)
 def wavefront():
@@ -48,11 +52,8 @@ def wavefront():
     return random_opd(3, npix=128).data * 1e9
 
 
-def opd_file(path, unit="nm"):
-    hdu = fits.PrimaryHDU(wavefront())
-    if unit:
-        hdu.header["BUNIT"] = unit
-    hdu.writeto(path)
+def opd_file(path):
+    fits.PrimaryHDU(wavefront(), fits.Header({"BUNIT": "nm"})).writeto(path)
     return path
 
 
@@ -71,7 +72,8 @@ def test_help_of_a_command_has_sections_and_examples(capsys, command):
         (["fit"], "No such command 'fit'"),
         (["reduce", "-o", "x", "--opd", "y"], "Missing argument 'FRAMES...'"),
         (["detect", "x", "--opd", "y"], "Missing option '-o'"),
-        (["detect", "x", "-o", "y"], "Missing option '--opd'"),
+        (["detect", "x", "-o", "y"], "'--opd'. Name the FITS file of a wavefront map"),
+        (["learn", "x", "-o", "y"], "flat to start without one"),
         (["detect", "x", "-o", "y", "--opd", "z", "--opd-date", "closest"], "nearest"),
         (["detect", "x", "-o", "y", "--opd", "z", "--threshold", "-3"], "--threshold: got -3"),
         (["detect", "x", "-o", "y", "--opd", "z", "--star-flux", "9 parsec"], "--star-flux: got"),
@@ -99,31 +101,39 @@ def test_wrong_options_are_usage_errors(tmp_path, monkeypatch, capsys, arguments
     assert list(tmp_path.iterdir()) == []
 
 
-def test_psf_writes_the_image_of_the_model(tmp_path, capsys):
+def test_psf_writes_the_image_of_the_model(tmp_path, capsys, monkeypatch):
+    small = partial(nircam_coronagraph, npix=192)  # The command has 1024, which takes seconds.
+    monkeypatch.setattr("pyklip_diffrender.instrument.nircam.nircam_coronagraph", small)
     path = tmp_path / "star.fits"
     opd = opd_file(tmp_path / "opd.fits")
-    arguments = ["psf", "-o", str(path), *WAVELENGTH, "--size", "20", "--opd", str(opd)]
+    arguments = [
+        "psf",
+        "-o",
+        str(path),
+        "--monochromatic",
+        "4.5e-6",
+        "--size",
+        "20",
+        "--opd",
+        str(opd),
+    ]
     path.write_text("mine")
     assert main(arguments) == 1
-    shown = capsys.readouterr().err
-    assert str(path) in shown
-    assert "--overwrite" in shown
+    assert re.search(rf"{re.escape(str(path))}.*--overwrite", capsys.readouterr().err)
     assert path.read_text() == "mine"
     assert main([*arguments, "--overwrite", "--offset", "0.02", "-0.3"]) == 0
     assert str(path) in capsys.readouterr().out
     with open_fits(path) as hdus:
         image, header = hdus[0].data, hdus[0].header
-    assert (header["FILTER"], header["CORONMSK"], header["PUPIL"]) == (
-        "F444W", "MASK335R", "MASKRND",
-    )  # fmt: skip
-    assert (header["STAROFFX"], header["STAROFFY"]) == (0.02, -0.3)
-    assert header["PUPILOPD"] == "opd.fits"
-    assert header["WAVELEN"] == 4.5e-6
+    wanted = {
+        "FILTER": "F444W", "CORONMSK": "MASK335R", "PUPIL": "MASKRND", "STAROFFX": 0.02,
+        "STAROFFY": -0.3, "PUPILOPD": "opd.fits", "WAVELEN": 4.5e-6,
+    }  # fmt: skip
+    assert {name: header[name] for name in wanted} == wanted
     assert header["PIXELSCL"] == pytest.approx(0.062424185)
-    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, fov_pixels=20)
-    map_ = resample(random_opd(3, npix=128).data, 1024)
     with torch.no_grad():
-        expected = model(map_, (0.02, -0.3)).numpy()
+        model = small("F444W", monochromatic=4.5e-6, fov_pixels=20)
+        expected = model(resample(1e-9 * wavefront(), 192), (0.02, -0.3)).numpy()
     np.testing.assert_allclose(image, expected, rtol=1e-9)
     # The star is below the middle, as asked for.
     assert np.unravel_index(image.argmax(), image.shape)[0] < 9
@@ -151,10 +161,8 @@ def test_errors_go_to_stderr_and_nothing_is_written(tmp_path, monkeypatch, capsy
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.startswith("pyklip-diffrender: ")
-    assert "Traceback" not in shown.err
     assert not PYTHON.search(shown.err)
-    for word in words:
-        assert word in shown.err
+    assert all(word in shown.err for word in words)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -162,11 +170,8 @@ def test_errors_go_to_stderr_and_nothing_is_written(tmp_path, monkeypatch, capsy
 def test_detect_in_a_broken_file_leaves_no_product(tmp_path, capsys, percent):
     frames, products = tmp_path / "calints.fits", tmp_path / "products"
     if percent:
-        fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 90, 90)), name="SCI")]).writeto(
-            frames
-        )
-        whole = frames.read_bytes()
-        frames.write_bytes(whole[: len(whole) * percent // 100])
+        calints(frames, np.ones((2, 90, 90)))
+        frames.write_bytes(frames.read_bytes()[: frames.stat().st_size * percent // 100])
     opd = opd_file(tmp_path / "opd.fits")
     assert main(["detect", str(frames), "--opd", str(opd), "-o", str(products)]) == 1
     assert "calints.fits" in capsys.readouterr().err
@@ -195,13 +200,88 @@ def test_products_are_refused_before_any_work(tmp_path, capsys, command, product
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("extra", [[], ["--overwrite"]], ids=["plain", "overwrite"])
-def test_an_output_that_is_a_file_is_refused(tmp_path, capsys, extra):
+def test_an_output_that_is_a_file_is_refused(tmp_path, capsys):
     path = tmp_path / "products"
     path.write_text("mine")
-    assert main(["reduce", "nowhere.fits", "--opd", "nowhere.fits", "-o", str(path), *extra]) == 1
+    arguments = ["reduce", "nowhere.fits", "--opd", "nowhere.fits", "-o", str(path)]
+    assert main([*arguments, "--overwrite"]) == 1
     assert f"{path} is a file, expected a folder" in capsys.readouterr().err
     assert path.read_text() == "mine"
+
+
+def link(path, target):
+    try:
+        path.symlink_to(target)
+    except OSError:
+        pytest.skip("links cannot be made here")
+    return path
+
+
+@pytest.mark.parametrize("place", ["dangling", "inside", "loop", "product"])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_links_that_lead_nowhere_are_refused_before_the_fit(tmp_path, place, overwrite):
+    output, product = tmp_path / "out", tmp_path / "out" / "report.html"
+    links = {output: "nowhere"}
+    if place == "inside":
+        output = tmp_path / "link" / "out"
+        links = {tmp_path / "link": "nowhere"}
+    elif place == "loop":
+        links = {output: "other", tmp_path / "other": "out"}
+    elif place == "product":
+        output.mkdir()
+        links = {product: "nowhere"}
+    for path, target in links.items():
+        link(path, target)
+    with pytest.raises(IncompatibleSetupError, match=r"--output: .* is a link to .*, which does"):
+        Run().claim_folder(output, ("report.html",), overwrite)
+    with pytest.raises(IncompatibleSetupError, match=r"OUTPUT: .* is a link to "):
+        Run().claim_file(product if place == "product" else output, overwrite)
+
+
+def test_a_link_to_a_folder_is_taken(tmp_path):
+    (tmp_path / "real").mkdir()
+    Run().claim_folder(link(tmp_path / "out", tmp_path / "real"), ("report.html",), False)
+    Run().claim_file(tmp_path / "out" / "star.fits", False)
+
+
+def closed():
+    stream = io.StringIO()
+    stream.close()
+    return stream
+
+
+class Broken(io.StringIO):
+    def flush(self):
+        raise OSError("Bad file descriptor")
+
+
+@pytest.mark.parametrize("stream", [lambda: None, closed, Broken])
+def test_a_program_without_standard_streams_ends_as_with_them(monkeypatch, capsys, stream):
+    monkeypatch.setattr(sys, "stdout", stream())
+    monkeypatch.setattr(sys, "stderr", stream())
+    for arguments, status in ((["--help"], 0), (["psf", "-o", "no/such/star.fits"], 1), (["x"], 2)):
+        assert main(arguments) == status
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("survey.py", "needs `if __name__ == '__main__':`"),
+        ("<stdin>", "came from standard input"),
+        (None, "came from standard input"),
+    ],
+)
+def test_a_script_from_standard_input_is_not_told_to_add_a_guard(monkeypatch, file, words):
+    script = ModuleType("__main__")
+    script.__file__ = file
+    monkeypatch.setitem(sys.modules, "__main__", script)
+    monkeypatch.delattr(sys, "ps1", raising=False)
+    assert words in execution._why_not_spawned()
+
+
+def write_frame(folder, name, **cards):
+    data = np.random.default_rng(1).normal(10, 2, (2, 8, 10)).astype(np.float32)
+    calints(folder / f"{name}_calints.fits", data, primary={"INSTRUME": None, **cards})
 
 
 @pytest.fixture
@@ -209,10 +289,8 @@ def frames(tmp_path):
     """A folder with frames of a target and of a reference star, and an empty file."""
     folder = tmp_path / "frames"
     folder.mkdir()
-    data = np.random.default_rng(1).normal(10, 2, (2, 8, 10)).astype(np.float32)
     for name, star in (("one", "HIP-1"), ("two", "HIP-2")):
-        cards = {"TARGPROP": star, "IS_PSF": name == "two", "INSTRUME": None}
-        calints(folder / f"{name}_calints.fits", data, primary=cards)
+        write_frame(folder, name, TARGPROP=star, IS_PSF=name == "two")
     (folder / "three_calints.fits").write_bytes(b"")
     return folder
 
@@ -222,8 +300,8 @@ def maps(tmp_path):
     """A folder of wavefront maps from before and after the frames."""
     folder = tmp_path / "maps"
     folder.mkdir()
-    opd_file(folder / "opd_2022-07-20.fits")
-    opd_file(folder / "opd_2022-07-31.fits")
+    for day in ("20", "31"):
+        opd_file(folder / f"opd_2022-07-{day}.fits")
     return folder
 
 
@@ -244,11 +322,8 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(tmp_path, reduc
     arguments = [*reducing, "--dry-run"]
     assert main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
-    target, reference = (
-        next(line for line in lines if name in line) for name in ("one_calints", "two_calints")
-    )
-    assert target.split()[:2] == ["target", "HIP-1"]
-    assert reference.split()[:2] == ["reference", "HIP-2"]
+    for name, words in (("one", ["target", "HIP-1"]), ("two", ["reference", "HIP-2"])):
+        assert next(line for line in lines if f"{name}_calints" in line).split()[:2] == words
     assert any(line.startswith("left out: three_calints.fits: ") for line in lines)
     sensed = "opd_2022-07-31.fits, sensed 2022-07-31T00:00, 0.9 days after the frames"
     assert f"wavefront map: {sensed}" in lines
@@ -299,23 +374,23 @@ def test_a_full_disk_is_noticed_before_the_work(reducing, reduced, capsys, monke
 def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
     tmp_path, reducing, reduced, capsys
 ):
-    arguments, products = reducing, tmp_path / "products"
+    products = tmp_path / "products"
     products.mkdir()
     (products / UNFINISHED).write_text("{}")
     reduced.error = KeyboardInterrupt()
-    assert main([*arguments, "--resume"]) == 130
+    assert main([*reducing, "--resume"]) == 130
     assert "--resume" in capsys.readouterr().err
     reduced.error = None
     # Without the option, nothing is replaced.
-    assert main(arguments) == 1
+    assert main(reducing) == 1
     assert UNFINISHED in capsys.readouterr().err
-    assert main([*arguments, "--resume", "--quick"]) == 0
+    assert main([*reducing, "--resume", "--quick"]) == 0
     assert reduced[0].given.options.accuracy == "quick"
     (products / UNFINISHED).unlink()
-    assert main([*arguments, "--resume"]) == 0
+    assert main([*reducing, "--resume"]) == 0
     assert "this reduction has finished" in capsys.readouterr().out
     assert len(reduced) == 1
-    assert main([*arguments, "--resume", "--overwrite"]) == 2
+    assert main([*reducing, "--resume", "--overwrite"]) == 2
     assert "--resume keeps products" in capsys.readouterr().err
 
 
@@ -324,50 +399,52 @@ def two_filters(folder):
     frames = folder / "frames"
     frames.mkdir()
     for name in ("F356W", "F444W"):
-        cards = {"TARGPROP": "HIP-1", "FILTER": name, "INSTRUME": None}
-        data = np.random.default_rng(1).normal(10, 2, (2, 8, 10))
-        calints(frames / f"{name}_calints.fits", data, primary=cards)
+        write_frame(frames, name, TARGPROP="HIP-1", FILTER=name)
     return frames
 
 
+@pytest.fixture
+def both_filters(tmp_path, maps):
+    """Arguments of a reduction in two filters."""
+    options = ["--opd", str(maps), "-o", str(tmp_path / "products"), "--size", "8"]
+    return ["reduce", str(two_filters(tmp_path)), *options]
+
+
 def test_spectra_that_do_not_cover_a_filter_are_an_error_before_any_fit(
-    tmp_path, maps, reduced, capsys
+    tmp_path, both_filters, reduced, capsys
 ):
     table = tmp_path / "short.txt"
     table.write_text("# micron Y\n3.0 1\n3.5 2\n4.1 3\n", encoding="utf-8")
-    arguments = ["reduce", str(two_filters(tmp_path)), "--opd", str(maps), "--size", "8"]
-    arguments += ["-o", str(tmp_path / "products"), "--spectra", str(table)]
-    assert main(arguments) == 1
+    assert main([*both_filters, "--spectra", str(table)]) == 1
     assert re.search(r"Y: .* F444W needs", capsys.readouterr().err)
     assert reduced == []
 
 
 def test_a_resumed_command_keeps_reductions_and_searches_them_together_again(
-    tmp_path, maps, reduced, capsys
+    tmp_path, both_filters, reduced, capsys
 ):
     """Two filters, of which one had finished before the interruption."""
-    frames, products = two_filters(tmp_path), tmp_path / "products"
-    place = (0.6, 0.35)
+    products, place = tmp_path / "products", (0.6, 0.35)
     made = {
         "F356W": searched("F356W", 2, [(*place, 4.0)]),
         "F444W": searched("F444W", 1, [(*place, 4.2)], north=20.0),
     }
-    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "--size", "8"]
+    detection = products / "F356W" / "detection.fits"
     write_searched(made["F356W"], products / "F356W")
+    before = detection.stat().st_mtime_ns
     reduced.error = KeyboardInterrupt()
-    assert main([*arguments, "--resume"]) == 130
+    assert main([*both_filters, "--resume"]) == 130
     assert not (products / "combined.fits").exists()
     reduced.error = None
-    before = (products / "F356W" / "detection.fits").stat().st_mtime_ns
     reduced.writes = lambda folder: write_searched(made[folder.name], folder)
-    assert main([*arguments, "--resume"]) == 0
+    assert main([*both_filters, "--resume"]) == 0
     shown = capsys.readouterr().out
     assert f"{products / 'F356W'}: this reduction has finished" in shown
     assert "combined search of 2 reductions: 1 candidate" in shown
-    assert (products / "F356W" / "detection.fits").stat().st_mtime_ns == before
+    assert detection.stat().st_mtime_ns == before
     assert len(reduced) == 1
     # With nothing left to reduce, the search is made again: now with one spectrum.
-    assert main([*arguments, "--resume", "--spectra", "flat"]) == 0
+    assert main([*both_filters, "--resume", "--spectra", "flat"]) == 0
     assert len(reduced) == 1
     assert fits.getdata(products / "combined.fits", "SNR").shape[0] == 1
     content = json.loads((products / "comparison.json").read_text(encoding="utf-8"))
@@ -396,8 +473,8 @@ class StubReduction:
         path = folder / "summary.json"
         if self.writes is not None:
             self.writes(folder)
-            return [folder / "report.html", path]
-        path.write_text(json.dumps(SUMMARY))
+        else:
+            path.write_text(json.dumps(SUMMARY))
         if self.interrupted:
             raise KeyboardInterrupt
         return [folder / "report.html", path]
@@ -501,9 +578,7 @@ def test_general_options_stand_before_or_after_the_command(
     assert main([*general, *detecting] if before else [*detecting, *general]) == 0
     assert threads == [1]
     assert capsys.readouterr().err == ""
-    lines = log.read_text().splitlines()
-    assert any("INFO 1. products" in line for line in lines)
-    assert any("opd_2022-07-31.fits" in line for line in lines)
+    assert re.search(r"opd_2022-07-31\.fits(.|\n)*INFO 1\. products", log.read_text())
     # What the run changed is as it was.
     assert not any(getattr(h, "baseFilename", "") == str(log) for h in logging.root.handlers)
 
@@ -577,10 +652,8 @@ def test_a_written_configuration_gives_the_same_run(
     assert capsys.readouterr().out == f"wrote {config}\n"
     assert reduced == []
     content = tomllib.loads(config.read_text())["reduce"]
-    assert content["frames"] == [str(frames)]
-    assert content["opd"] == str(maps)
-    assert content["quiet"] is True
-    assert content["json"] is False
+    assert (content["frames"], content["opd"]) == ([str(frames)], str(maps))
+    assert (content["quiet"], content["json"]) == (True, False)
     assert main(["reduce", "--config", str(config)]) == 0
     assert main(["--config", str(config), "reduce", "--threshold", "6", "--overwrite"]) == 0
     assert [call.given.options.threshold for call in reduced] == [5, 6]
@@ -611,34 +684,17 @@ def test_a_wrong_configuration_is_a_usage_error(tmp_path, capsys, content, words
     assert not star.exists()
 
 
-def test_a_missing_map_is_answered_with_what_there_is(capsys):
-    words = ("'--opd'", "a folder of maps", "mast to fetch", "flat to start without one")
-    for command in ("detect", "reduce", "learn"):
-        assert main([command, "x", "-o", "y"]) == 2
-        shown = capsys.readouterr().err
-        assert all(each in shown for each in words)
-
-
-def test_the_documented_configuration_is_valid(tmp_path):
-    page = (ROOT / "docs" / "reference" / "command_line.md").read_text(encoding="utf-8")
-    example = page.partition("```toml\n")[2].partition("```")[0]
-    assert '[reduce]\nframes = ["calints"]' in example
-    path = tmp_path / "run.toml"
-    path.write_text(example)
-    assert read_config(application, path)["reduce"]["log_file"] == "products/run.log"
-
-
 @pytest.mark.slow
 def test_doctor_reports_versions_data_machine_and_a_fit(monkeypatch, capsys):
     monkeypatch.delenv("STPSF_PATH", raising=False)
     status = main(["doctor"])
-    lines = capsys.readouterr().out.splitlines()
-    assert status == int(any(line.startswith("FAIL") for line in lines))
-    assert f"ok    torch {version('torch')}" in lines
-    assert any(line.startswith("ok    data files: ") for line in lines)
-    assert any("of memory are free" in line for line in lines)
-    assert any("STPSF_PATH is not set" in line and line.startswith("note") for line in lines)
-    assert any(line.startswith("ok    self-test in") for line in lines)
+    shown = capsys.readouterr().out
+    assert status == bool(re.search("^FAIL", shown, re.MULTILINE))
+    for line in (
+        f"ok    torch {version('torch')}$", "ok    data files: ", ".* of memory are free",
+        "note .*STPSF_PATH is not set", "ok    self-test in",
+    ):  # fmt: skip
+        assert re.search(f"^{line}", shown, re.MULTILINE), line
 
 
 def test_doctor_fails_with_a_sentence(tmp_path, monkeypatch):

@@ -34,11 +34,9 @@ def fitted(filter, wavelength, seed):
     """A small frame of a star, searched, with maps in double precision at its pixels."""
     model = dr.nircam_coronagraph(filter, monochromatic=wavelength, npix=64, fov_pixels=16)
     opd = dr.random_opd(1, npix=64)
-    frame = replace(
-        dr.simulate(model, dr.Scene(), opd, seed=seed), position_angles=np.array([40.0])
-    )
-    fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=3))
-    return dr.detect(fit)
+    frame = dr.simulate(model, dr.Scene(), opd, seed=seed)
+    frame = replace(frame, position_angles=np.array([40.0]))
+    return dr.detect(dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=3)))
 
 
 @pytest.fixture(scope="module")
@@ -50,11 +48,10 @@ def stacked(models):
     """One model of the data of several, whose unknowns are independent."""
     unknowns, frames, count = [], [], 0
     for model in models:
-        unknowns += [Unknown(f"{count} {each.name}"[:20], each.component, each.frame)
-                     for each in model.unknowns]  # fmt: skip
-        frames += [
-            replace(each, rows=each.rows + count, drift=each.drift + count) for each in model.frames
-        ]
+        for each in model.unknowns:
+            unknowns.append(Unknown(f"{count} {each.name}"[:20], each.component, each.frame))
+        for each in model.frames:
+            frames.append(replace(each, rows=each.rows + count, drift=each.drift + count))
         count += len(model.unknowns)
     columns = (
         torch.cat([getattr(each, name) for each in models])
@@ -99,13 +96,10 @@ def test_it_is_the_joint_likelihood_of_all_frames(pair):
         scale = 1e-8 * np.sqrt(information)
         assert np.all(np.abs(table["amplitude"][:, k] * information - vector.numpy()) < scale)
     # Free fluxes are those of both templates fitted together, which do not share pixels.
-    zero = torch.zeros_like(images[0])
-    first, second = (
-        {0: torch.cat([images[0], zero]), 1: torch.cat([torch.zeros_like(images[1]), images[1]])},
-        3,
-    )
-    matrix, vector = joint.normal_equations(first)
-    both_fluxes = torch.linalg.solve(matrix[::second, ::second], vector[::second]).numpy()
+    zero, step = torch.zeros_like(images[0]), len(pixels)
+    apart = {0: torch.cat([images[0], zero]), 1: torch.cat([zero, images[1]])}
+    matrix, vector = joint.normal_equations(apart)
+    both_fluxes = torch.linalg.solve(matrix[::step, ::step], vector[::step]).numpy()
     measured = [table["contrast_F444W"][0], table["contrast_F356W"][0]]
     errors = [table["contrast_error_F444W"][0], table["contrast_error_F356W"][0]]
     assert np.all(np.abs(measured - both_fluxes) < 1e-8 * np.array(errors))
@@ -122,9 +116,8 @@ def test_a_combination_of_products_is_that_of_the_detections(pair, tmp_path):
     assert read.spectra.names == ("as the star",)
     assert "--star-sed" in read.remarks[0]
     paths = read.write(tmp_path / "both")
-    assert [each.name for each in paths] == [
-        "combined.fits", "combined_candidates.ecsv", "combined_limits.ecsv"
-    ]  # fmt: skip
+    names = ["combined.fits", "combined_candidates.ecsv", "combined_limits.ecsv"]
+    assert [each.name for each in paths] == names
     limits = QTable.read(paths[2])
     assert limits.meta["sigmas"] == pytest.approx(read.limits.meta["sigmas"])
     assert 0 < limits["contrast"].min() < limits["contrast"].max() < 1e-2
@@ -168,12 +161,8 @@ def test_the_colour_says_which_spectrum():
     assert 150 <= temperature <= 300
     assert both.candidates["spectrum_chi2"][0] < 9
     warm = dr.combine([cold, searched("F356W", 2, [(0.6, 0.3, 30.0)], known=True)])
-    assert warm.candidates["spectrum"][0] in (
-        "black body of 1200 K",
-        "black body of 1500 K",
-        "flat",
-    )
-    assert len(warm.candidates) == 1
+    (spectrum,) = warm.candidates["spectrum"]
+    assert spectrum in ("black body of 1200 K", "black body of 1500 K", "flat")
 
 
 def test_a_source_of_one_filter_alone_is_found_with_free_fluxes_and_keeps_its_flux():
@@ -186,11 +175,11 @@ def test_a_source_of_one_filter_alone_is_found_with_free_fluxes_and_keeps_its_fl
 
 
 def test_errors_that_are_hardly_known_need_a_higher_peak():
-    sources = [(0.6, 0.35, 5.0)]
-    known = dr.combine([searched("F444W", 1, sources), searched("F356W", 2, sources)])
-    unsure = dr.combine(
-        [searched("F444W", 1, sources, freedom=8.0), searched("F356W", 2, sources, freedom=8.0)]
-    )
+    known, unsure = (
+        dr.combine([searched(name, seed, [(0.6, 0.35, 5.0)], freedom=freedom)
+                    for name, seed in (("F444W", 1), ("F356W", 2))])
+        for freedom in (np.inf, 8.0)
+    )  # fmt: skip
     assert len(known.candidates) == 1
     assert len(unsure.candidates) == 0
     np.testing.assert_allclose(known.snr, unsure.snr)
@@ -240,21 +229,19 @@ def test_frames_count_once():
 def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path):
     one = searched("F444W", 1, header={"TARGPROP": "HD 1", "TARG_RA": 10.0, "TARG_DEC": 5.0})
     other = searched("F356W", 2, header={"TARGPROP": "HD 2", "TARG_RA": 90.0, "TARG_DEC": 5.0})
-    with pytest.raises(IncompatibleSetupError, match="HD 1 and HD 2"):
-        dr.combine([one, other])
-    with pytest.raises(IncompatibleSetupError, match="no position angle"):
-        dr.combine([searched("F444W"), searched("F356W", north=None)])
-    later = searched("F444W", 2, mjd=60400.0)
-    with pytest.raises(IncompatibleSetupError, match="proper_motion="):
-        dr.combine([searched("F444W", 1), later])
-    with pytest.raises(IncompatibleSetupError, match="expected a Reduction"):
-        dr.combine([3, 4])
-    with pytest.raises(IncompatibleSetupError, match="spectra: got none"):
-        dr.combine([searched("F444W"), searched("F356W")], spectra=[])
     short = tmp_path / "short.txt"
     short.write_text("# micron Y T\n3.0 1 1\n3.5 2 nan\n4.2 3 2\n", encoding="utf-8")
-    with pytest.raises(IncompatibleSetupError, match=r"Y: .* F444W needs"):
-        dr.combine([searched("F444W"), searched("F356W")], spectra=str(short))
+    good = [searched("F444W"), searched("F356W")]
+    for found, spectra, words in (
+        ([one, other], None, "HD 1 and HD 2"),
+        ([good[0], searched("F356W", north=None)], None, "no position angle"),
+        ([good[0], searched("F444W", 2, mjd=60400.0)], None, "proper_motion="),
+        ([3, 4], None, "expected a Reduction"),
+        (good, [], "spectra: got none"),
+        (good, str(short), "Y: .* F444W needs"),
+    ):
+        with pytest.raises(IncompatibleSetupError, match=words):
+            dr.combine(found, **({} if spectra is None else {"spectra": spectra}))
 
 
 def test_spectra_come_from_a_table_of_model_atmospheres(tmp_path):
@@ -278,7 +265,7 @@ def test_spectra_come_from_a_table_of_model_atmospheres(tmp_path):
     assert ratio < cold[0] < 3 * ratio
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
+@pytest.mark.parametrize("count", [1, 4])
 def test_free_fluxes_at_one_place_follow_chi_bar_squared(count):
     stack = SkyStack(
         np.zeros((count, 1)), np.zeros((count, 1)), np.ones((count, 1)), np.zeros((count, 2, 2))
@@ -290,13 +277,10 @@ def test_free_fluxes_at_one_place_follow_chi_bar_squared(count):
         assert Family(None, stack, 1.0).expected(level) == pytest.approx(rare, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    "names", [("F444W", "F356W"), pytest.param(("F444W", "F356W", "F210M"), marks=pytest.mark.slow)]
-)
-def test_noise_has_as_many_peaks_as_expected(names):
+def test_noise_has_as_many_peaks_as_expected():
     """Fine maps of noise: the share with a peak above a level, for black bodies and free fluxes."""
-    count, side = 1000, 40
-    errors = np.array([1.0, 0.6, 0.8])[: len(names), None]
+    count, side, names = 500, 40, ("F444W", "F356W")
+    errors = np.array([[1.0], [0.6]])
     spectra = planet_spectra(["blackbody", "flat"], names).flux
     stack = SkyStack(
         np.zeros((len(names), side**2)), np.zeros((len(names), side**2)),
@@ -332,12 +316,11 @@ def test_parallax_and_proper_motion_are_those_of_astropy():
     np.testing.assert_allclose(motion.background(before, after), expected, atol=5e-4)
 
 
-def epochs(first, second, seed = 0,
-           days = 400.0):  # fmt: skip
-    """A source at two epochs."""
+def epochs(first, second, seed=0):
+    """A source at two epochs, 400 days from each other."""
     return [
         searched("F444W", 2 * seed + 1, [first], mjd=59900.0),
-        searched("F444W", 2 * seed + 2, [second], mjd=59900.0 + days, north=25.0),
+        searched("F444W", 2 * seed + 2, [second], mjd=60300.0, north=25.0),
     ]
 
 
@@ -353,9 +336,8 @@ def test_epochs_tell_companions_from_the_background():
     assert sky.candidates["ln_evidence_ratio"][0] < -5
     elsewhere = epochs((*start, 9.0), (-0.6, -0.5, 9.0))
     neither = dr.combine(elsewhere, proper_motion=MOTION)
-    assert set(neither.candidates["verdict"]) == {
-        "neither moves with the star nor stays on the sky"
-    }
+    verdicts = set(neither.candidates["verdict"])
+    assert verdicts == {"neither moves with the star nor stays on the sky"}
     assert any("parallax" in each for each in neither.remarks)
     still = dr.combine(epochs((*start, 9.0), (*start, 9.0)), proper_motion=(0.004, 0.0))
     assert list(still.candidates["verdict"]) == ["not decided"]

@@ -1,4 +1,4 @@
-"""Commands and code of the README and the documentation: they parse, and what they name exists.
+"""Commands and code of README, documentation and docstrings: what they name exists, and is right.
 
 Code cells of the tutorials are run by the build of the documentation.
 """
@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import ast
 import builtins
+import doctest
 import importlib
-import importlib.util
 import inspect
 import re
 import shlex
@@ -30,12 +30,9 @@ PAGES += [path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not
 PROGRAM = "pyklip-diffrender"
 
 OBJECTS = {
-    "detection": dr.Detection,
-    "fit": dr.Refinement,
-    "result": dr.Reduction,
-    "sequence": dr.Sequence,
-    "wavefront": OPDMap,
-}
+    "detection": dr.Detection, "fit": dr.Refinement, "result": dr.Reduction,
+    "sequence": dr.Sequence, "wavefront": OPDMap,
+}  # fmt: skip
 """Classes of variables that the documentation calls by these names."""
 
 
@@ -90,32 +87,25 @@ def commands(program):
                 yield place, words[len(program.split()) :]
 
 
-CALLS = list(commands(PROGRAM))
-
-
-@pytest.mark.parametrize(
-    ("place", "arguments"),
-    [pytest.param(*call, id=f"{call[0]}-{k}") for k, call in enumerate(CALLS)],
-)
-def test_documented_commands_parse(tmp_path, monkeypatch, place, arguments):
+def test_documented_commands_parse(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    name, *rest = arguments
-    if name == "COMMAND":
-        return
     page = (ROOT / "docs/reference/command_line.md").read_text(encoding="utf-8")
     Path("run.toml").write_text(page.partition("```toml\n")[2].partition("```")[0])
-    assert name in application.commands, f"{place}: no command {name}"
-    command = application.commands[name]
-    if place.endswith(".md"):  # In the text a command need not be complete.
-        options = {option for each in command.params for option in each.opts}
-        assert {word for word in rest if word.startswith("-")} <= options, place
-        return
-    try:
-        # In the context of the program, whose options for help the commands take over.
-        parent = click.Context(application, info_name=PROGRAM, **application.context_settings)
-        command.make_context(name, rest, parent=parent)
-    except click.UsageError as error:
-        pytest.fail(f"{place}: {error.format_message()}")
+    calls = [call for call in commands(PROGRAM) if call[1][0] != "COMMAND"]
+    assert len(calls) > 20
+    for place, (name, *rest) in calls:
+        assert name in application.commands, f"{place}: no command {name}"
+        command = application.commands[name]
+        if place.endswith(".md"):  # In the text a command need not be complete.
+            options = {option for each in command.params for option in each.opts}
+            assert {word for word in rest if word.startswith("-")} <= options, place
+            continue
+        try:
+            # In the context of the program, whose options for help the commands take over.
+            parent = click.Context(application, info_name=PROGRAM, **application.context_settings)
+            command.make_context(name, rest, parent=parent)
+        except click.UsageError as error:
+            pytest.fail(f"{place}: {error.format_message()}")
 
 
 @pytest.mark.parametrize("program", ["python -m", "python"])
@@ -144,9 +134,8 @@ def test_documented_scripts_have_the_options(program):
 PYTHON = [block for block in blocks() if block.language == "python"]
 
 
-@pytest.mark.parametrize("block", PYTHON, ids=str)
-def test_names_and_arguments_in_documented_code_exist(block):
-    for node in ast.walk(ast.parse(block.text)):
+def test_names_and_arguments_in_documented_code_exist():
+    for block, node in ((each, node) for each in PYTHON for node in ast.walk(ast.parse(each.text))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pyklip_diffrender"):
             module = importlib.import_module(node.module or "")
             for name in node.names:
@@ -211,23 +200,45 @@ def test_documented_code_imports_names_before_it_uses_them(page):
             known |= bound(statement) | {n.id for n in names if isinstance(n.ctx, ast.Store)}
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_attributes_that_the_text_names_exist(path):
-    prose = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
-    if path.name == "changelog.md":
-        return
-    for owner, name in re.findall(r"`(?:dr\.)?([A-Z]\w+)\.(\w+)", prose):
-        if owner in dr.__all__:
-            assert name in members(getattr(dr, owner)), f"{path.name}: no {owner}.{name}"
-    for name in re.findall(r"`dr\.(\w+)", prose):
-        assert hasattr(dr, name), f"{path.name}: no dr.{name}"
+def test_attributes_and_files_that_the_text_names_exist():
+    for path in PAGES:
+        text = path.read_text(encoding="utf-8")
+        prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+        for owner, name in re.findall(r"`(?:dr\.)?([A-Z]\w+)\.(\w+)", prose):
+            if owner in dr.__all__ and path.name != "changelog.md":
+                assert name in members(getattr(dr, owner)), f"{path.name}: no {owner}.{name}"
+        for name in re.findall(r"`dr\.(\w+)", prose):
+            assert hasattr(dr, name) or path.name == "changelog.md", f"{path.name}: no dr.{name}"
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text) if path in PAGES[:2] else ():
+            exists = target.startswith("http") or (ROOT / target).exists()
+            assert exists, f"{path.name}: {target}"
 
 
-def test_links_of_the_readme_exist():
-    for path in PAGES[:2]:
-        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text(encoding="utf-8")):
-            if not target.startswith("http"):
-                assert (ROOT / target).exists(), f"{path.name}: {target}"
+NAMES = sorted(
+    name
+    for name in dr.__all__
+    if not name.startswith("__")
+    and not (inspect.isclass(each := getattr(dr, name)) and issubclass(each, Warning | Exception))
+)
+
+
+def takes_long(name):
+    """Whether the examples of a name fit, which takes seconds."""
+    lines = (inspect.getdoc(getattr(dr, name)) or "").splitlines()
+    return any("dr.refine(" in line for line in lines if "SKIP" not in line)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow) if takes_long(name) else name for name in NAMES],
+)
+def test_examples_of_public_names_give_what_they_say(name):
+    assert ">>>" in (inspect.getdoc(getattr(dr, name)) or "")
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    # Without the names of the module: a reader does not have them.
+    for each in doctest.DocTestFinder().find(getattr(dr, name), name, globs={}):
+        runner.run(each)
+    assert runner.summarize(verbose=False).failed == 0
 
 
 @pytest.mark.slow

@@ -33,27 +33,16 @@ READ_NOISE = 20.0
 
 @dataclass
 class World:
-    """A converted model of an earlier wavefront, and what the other code shows later.
-
-    Attributes
-    ----------
-    model : OpticalSystem
-    before, later : ndarray, (npix, npix)
-        Wavefronts, m.
-    star, light : ndarray, (ny, nx)
-        Images of the star and of the planet's place, by the other code, later.
-    seen : ndarray of bool, (npix, npix)
-        Where light passes the stop.
-    """
+    """A converted model of an earlier wavefront, and what the other code shows later."""
 
     model: OpticalSystem
-    before: Array
+    before: Array  # (npix, npix), wavefronts, m
     later: Array
-    star: Array
+    star: Array  # (ny, nx), images of the star and of the planet's place, by the other code, later
     light: Array
     planet: Planet
     flux: float
-    seen: Array
+    seen: Array  # (npix, npix), where light passes the stop
 
     def observed(self, seed):
         """A frame with photon and read noise."""
@@ -113,12 +102,8 @@ def test_a_frame_made_by_stpsf(stpsf_path):
     That conversions agree on STScI's own files at 1024 samples is shown in test_parity_stpsf.py.
     """
     npix = 256
-    call = {
-        "monochromatic": 4.5e-6,
-        "fov_pixels": 40,
-        "fft_oversample": 2,
-        "detector_oversample": 1,
-    }
+    call = {"monochromatic": 4.5e-6, "fov_pixels": 40, "fft_oversample": 2}
+    call["detector_oversample"] = 1
     with fits.open(stpsf_path / "JWST_OTE_OPD_cycle1_example_2022-07-30.fits") as hdus:
         opd = hdus[0].data + lopsided(npix, 77, 10e-9) * (hdus[0].data != 0)
         drifted = fits.HDUList([fits.PrimaryHDU(opd, hdus[0].header)])
@@ -141,26 +126,24 @@ def test_a_frame_made_by_stpsf(stpsf_path):
 DIAMETER = 2.4
 
 
-def coronagraph(opd, planet=None, *, pixels, oversample):
+def coronagraph(opd, planet=None):
     """A telescope of 2.4 m with one strut, a hard-edged spot and a ring-shaped stop."""
     npix = len(opd)
     y, x = (np.mgrid[:npix, :npix] - (npix - 1) / 2) * DIAMETER / npix
     radius = np.hypot(x, y)
     strut = (np.abs(x - 0.1) < 0.03) & (y > 0)
-    system = poppy.OpticalSystem(oversample=oversample, npix=npix, verbose=False)
+    system = poppy.OpticalSystem(oversample=1, npix=npix, verbose=False)
     system.pupil_diameter = DIAMETER * u.m
     sampling = {"pixelscale": DIAMETER / npix * u.m / u.pixel, "planetype": PlaneType.pupil}
-    primary = (radius < 0.5 * DIAMETER) & (radius > 0.18 * DIAMETER) & ~strut
+    primary = ((radius < 0.5 * DIAMETER) & (radius > 0.18 * DIAMETER) & ~strut).astype(float)
     system.add_pupil(
-        poppy.ArrayOpticalElement(
-            name="primary", transmission=primary.astype(float), opd=opd, **sampling
-        )
+        poppy.ArrayOpticalElement(name="primary", transmission=primary, opd=opd, **sampling)
     )
     system.add_inversion(axis="y")
     system.add_image(poppy.CircularOcculter(name="spot", radius=0.35))
     stop = stop_of(npix).astype(float)
     system.add_pupil(poppy.ArrayOpticalElement(name="stop", transmission=stop, **sampling))
-    system.add_detector(pixelscale=0.06, fov_pixels=pixels, oversample=oversample)
+    system.add_detector(pixelscale=0.06, fov_pixels=28, oversample=1)
     if planet is not None:
         system.source_offset_r = planet.separation
         system.source_offset_theta = planet.position_angle
@@ -172,39 +155,27 @@ def stop_of(npix):
     return (np.hypot(x, y) < 0.42) & (np.hypot(x, y) > 0.24)
 
 
-@pytest.mark.parametrize(
-    ("npix", "pixels", "oversample", "waves", "cycles"),
-    [
-        (64, 28, 1, (1.6e-6,), 5.0),
-        pytest.param(128, 36, 2, (1.55e-6, 1.65e-6), 6.0, marks=pytest.mark.slow),
-    ],
-)
-def test_a_frame_made_by_poppy(npix, pixels, oversample, waves, cycles):
+def test_a_frame_made_by_poppy():
     """Somebody's own coronagraph, whose modes are not those of JWST's segments."""
+    npix, wave = 64, 1.6e-6
     before = lopsided(npix, 1, 30e-9)
     # A part of a map has lower frequencies across the pupil than the whole.
     later = before + lopsided(2 * npix, 2, 10e-9)[:npix, :npix]
     planet = Planet(1e-4, 0.7, 130.0)
-    weights = [1.0, 2.0][: len(waves)]
-    shape = {"pixels": pixels, "oversample": oversample}
-
-    def image(source):
-        hdus = coronagraph(later, source, **shape).calc_psf(list(waves) * u.m, weight=weights)
-        samples = hdus[0].data.reshape(pixels, oversample, pixels, oversample)
-        return np.asarray(samples.sum(axis=(1, 3)), dtype=float)
-
-    model = from_poppy(coronagraph(before, **shape), list(waves) * u.m, weights)
-    star, light = image(None), image(planet)
+    model = from_poppy(coronagraph(before), wave)
+    star, light = (
+        np.asarray(coronagraph(later, source).calc_psf(wave * u.m)[0].data, dtype=float)
+        for source in (None, planet)
+    )
     world = World(model, before, later, star, light, planet, 5e8, stop_of(npix))
     free = ("star_offset", "flux", "background")
-    check(world, GaussNewton(basis=FourierModes(cycles), free=free, response_npix=npix))
+    check(world, GaussNewton(basis=FourierModes(5.0), free=free, response_npix=npix))
 
 
-@pytest.mark.parametrize("radius", [1.2, 4.0])
-def test_the_segments_of_jwst_are_no_modes_of_another_telescope(radius):
-    """Neither of a smaller one nor of one in which JWST would have a place."""
+def test_the_segments_of_jwst_are_no_modes_of_another_telescope():
+    """Even of one in which JWST would have a place."""
     osys = poppy.OpticalSystem(oversample=1, npix=64)
-    osys.add_pupil(poppy.CircularAperture(radius=radius, pad_factor=1.0))
+    osys.add_pupil(poppy.CircularAperture(radius=4.0, pad_factor=1.0))
     osys.add_detector(pixelscale=0.06, fov_pixels=16)
     model = from_poppy(osys, 4.4e-6)
     image = 1e6 * model().numpy()

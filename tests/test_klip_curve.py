@@ -36,20 +36,9 @@ def opd(seed):
     return np.asarray(dr.random_opd(seed, npix=NPIX).data)
 
 
-def frame(seed, angle, speckles=0.0, shift=(0.0, 0.0)):
-    """A frame whose star is `shift` arcsec off the middle, and its perfect fit.
-
-    Parameters
-    ----------
-    seed : int
-        Of the noise and of the wavefront that no other frame has.
-    angle : float
-        Position angle.
-    speckles : float
-        Size of that wavefront over that of the common one.
-    shift : tuple of float
-    """
-    wavefront = opd(1) + speckles * opd(seed) if speckles else opd(1)
+def frame(seed, angle, shift=(0.0, 0.0)):
+    """A frame whose star is `shift` arcsec off the middle, and its perfect fit."""
+    wavefront = opd(1)
     moved = torch.tensor(shift, dtype=torch.float64)
     with torch.no_grad():
         star = FLUX * model()(wavefront, detector_shift=moved).double().numpy()
@@ -57,12 +46,9 @@ def frame(seed, angle, speckles=0.0, shift=(0.0, 0.0)):
     data = star + noise * np.random.default_rng(seed).standard_normal(star.shape)
     scale = model().detector.pixelscale[0]
     observation = dr.Observation.from_arrays(
-        data,
-        noise,
-        pixelscale=scale,
-        center=(SIZE - 1) / 2 + np.array(shift) / scale,
+        data, noise, pixelscale=scale, center=(SIZE - 1) / 2 + np.array(shift) / scale,
         position_angles=angle,
-    )
+    )  # fmt: skip
     values = {"flux": np.array([FLUX]), "detector_shift": np.array(shift)}
     return FrameFit(
         model(), observation, {}, wavefront, star, np.zeros_like(star), values, {},
@@ -83,13 +69,15 @@ def curve_of(science, references=(), separations=None, hidden=False, sources=Non
     return klip_curve(searched, [each.observation for each in references], separations)
 
 
-def rolls(speckles=0.0):
-    return [frame(2, 0.0, speckles), frame(3, 20.0, speckles, (0.02, -0.03))]
+def seen(fitted, **changes):
+    """A frame with another observation."""
+    return replace(fitted, observation=replace(fitted.observation, **changes))
 
 
 @cache
 def frames():
-    return rolls(), [frame(4, 0.0, shift=(-0.03, 0.0)), frame(5, 0.0)]
+    rolls = [frame(2, 0.0), frame(3, 20.0, shift=(0.02, -0.03))]
+    return rolls, [frame(4, 0.0, shift=(-0.03, 0.0)), frame(5, 0.0)]
 
 
 @cache
@@ -118,7 +106,7 @@ def test_stars_are_aligned():
     """Half a pixel between the star and its recorded position makes the limits worse."""
     science, references = frames()
     wrong = [
-        replace(each, observation=replace(each.observation, center=each.observation.center + off))
+        seen(each, center=each.observation.center + off)
         for each, off in zip(references, (0.5, -0.5), strict=True)
     ]
     assert (curve_of(science, wrong, SEPARATIONS)["contrast"] > 1.2 * quiet()).any()
@@ -130,17 +118,16 @@ def test_candidates_are_not_noise():
     sources = Candidates.at([[0.5, 0.0], [-0.3, 0.4]], [1e-2, 4e-3])
     templates = Templates(SimpleNamespace(frames=science), science[0])
     light = templates.at(sources.offsets)
-    seen = []
+    crowded = []
     for k, each in enumerate(science):
         companion, planet = (sources.contrasts[:, None, None] * light[k]).numpy()
         data = each.observation.data + companion + planet
-        observation = replace(each.observation, data=data)
-        seen.append(replace(each, observation=observation, companion_image=companion))
-    curve = curve_of(seen, references, SEPARATIONS, sources=sources)
+        crowded.append(replace(seen(each, data=data), companion_image=companion))
+    curve = curve_of(crowded, references, SEPARATIONS, sources=sources)
     assert curve["contrast"] == pytest.approx(quiet(), rel=1e-6)
     # With either of the two in the frames, the ring at 0.5 arcsec has a worse limit.
     for k in range(2):
-        left = curve_of(seen, references, SEPARATIONS, sources=sources.without(k))
+        left = curve_of(crowded, references, SEPARATIONS, sources=sources.without(k))
         assert left["contrast"][0] > 2 * quiet()[0]
 
 
@@ -149,12 +136,7 @@ def test_noise_is_that_of_the_places_that_have_limits():
     science, references = frames()
     grid = science[0].grid
     bright = np.exp(-((grid - [0.45, -0.25]) ** 2).sum(axis=-1) / 0.01)
-    lit = [
-        replace(
-            each, observation=replace(each.observation, data=each.observation.data + 1e4 * bright)
-        )
-        for each in science
-    ]
+    lit = [seen(each, data=each.observation.data + 1e4 * bright) for each in science]
     worse = curve_of(lit, references, SEPARATIONS)["contrast"]
     assert (worse > 2 * quiet()).any()
     spared = curve_of(lit, references, SEPARATIONS, grid[..., 0] > -0.1)["contrast"]
@@ -168,14 +150,7 @@ def test_two_rolls_alone_and_masked_pixels():
     science, _ = frames()
     valid = science[0].observation.valid.copy()
     valid[0, 20, 20:22] = False
-    hole = replace(
-        science[0],
-        observation=replace(
-            science[0].observation,
-            valid=valid,
-            data=np.where(valid, science[0].observation.data, 0.0),
-        ),
-    )
+    hole = seen(science[0], valid=valid, data=np.where(valid, science[0].observation.data, 0.0))
     curve = curve_of([hole, science[1]], (), [500, 800, 5000] * u.mas)
     assert curve["separation"].to_value(u.arcsec) == pytest.approx(SEPARATIONS)
     assert list(curve["modes"]) == [1, 1]
@@ -189,9 +164,8 @@ def test_two_rolls_alone_and_masked_pixels():
 
 def test_without_references_there_is_no_curve():
     science, references = frames()
-    same = replace(science[1], observation=replace(science[1].observation, position_angles=None))
     with pytest.raises(IncompatibleSetupError, match="roll without references"):
-        curve_of([science[0], same])
+        curve_of([science[0], seen(science[1], position_angles=None)])
     with pytest.raises(IncompatibleSetupError, match="rings are complete"):
         curve_of(science, references, 3.0)
 

@@ -36,12 +36,14 @@ def _closed():
 @pytest.fixture(scope="module")
 def model():
     return dr.nircam_coronagraph(
-        "F444W",
-        monochromatic=4.5e-6,
-        npix=NPIX,
-        fov_pixels=(30, 34),
+        "F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=(30, 34),
         defaults={"detector_shift": AXIS},
-    )
+    )  # fmt: skip
+
+
+def in_frame(angle):
+    """The planet in a frame whose +y axis is at a position angle."""
+    return replace(PLANET, position_angle=PLANET.position_angle - angle)
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +52,7 @@ def frames(model):
     opd, made = random_opd(3, npix=NPIX).data, []
     scale = np.array(model.detector.pixelscale)
     for k, angle in enumerate(ANGLES):
-        place = replace(PLANET, position_angle=PLANET.position_angle - angle).offset
-        planet = model(opd, tuple(np.add(OFFSET, place)))
+        planet = model(opd, tuple(np.add(OFFSET, in_frame(angle).offset)))
         light = FLUX * (model(opd, OFFSET) + PLANET.contrast * planet).numpy()
         data = light + NOISE * np.random.default_rng(k).normal(size=light.shape)
         valid = np.ones(data.shape, dtype=bool)
@@ -68,14 +69,9 @@ def frames(model):
 
 @pytest.fixture(scope="module")
 def fit(model, frames):
-    first = replace(PLANET, position_angle=PLANET.position_angle - ANGLES[0])
-    settings = GaussNewton(basis=FourierModes(2), response_npix=NPIX, companions=(first,))
+    companion = in_frame(ANGLES[0])
+    settings = GaussNewton(basis=FourierModes(2), response_npix=NPIX, companions=(companion,))
     return dr.refine(model, frames, random_opd(3, npix=NPIX).data, settings=settings)
-
-
-@pytest.fixture(scope="module")
-def found(fit):
-    return dr.detect(fit)
 
 
 def shown(ax):
@@ -101,16 +97,21 @@ def points(ax, label):
     return np.stack(line.get_data(), axis=1)
 
 
-def bar_of(ax):
-    """The axes of the colour bar."""
+def label_of(ax):
+    """What the colour bar says."""
     (bar,) = ax.child_axes
-    return bar
+    return bar.get_ylabel()
 
 
 def arrows(ax):
     """Unit vectors of the compass, by letter."""
     found = {each.get_text(): np.subtract(each.xyann, each.xy) for each in ax.texts}
     return {name: v / np.hypot(*v) for name, v in found.items() if name in "NE"}
+
+
+def north(angle):
+    """Direction of north in a frame."""
+    return np.array([np.sin(np.deg2rad(angle)), np.cos(np.deg2rad(angle))])
 
 
 def test_a_frame_is_drawn_from_its_star(frames):
@@ -127,18 +128,15 @@ def test_a_frame_is_drawn_from_its_star(frames):
     np.testing.assert_allclose(place_of(ax, 14, 16) - place_of(ax, 13, 15), observation.pixelscale)
     offset = (np.array([16, 14]) - observation.center[0]) * observation.pixelscale
     np.testing.assert_allclose(place_of(ax, 14, 16), offset, atol=1e-12)
-    assert ax.get_xlabel() == "x from the star (arcsec)"
-    assert ax.get_ylabel() == "y from the star (arcsec)"
     assert ax.get_title(loc="left") == "HD 1, F444W"
-    assert bar_of(ax).get_ylabel() == "photon"
+    assert label_of(ax) == "photon"
 
 
-@pytest.mark.parametrize("angle", [0.0, 70.0, 200.0])
-def test_the_compass_points_where_planets_are(frames, angle):
-    ax = replace(frames[0], position_angles=np.array([angle])).plot()
+def test_the_compass_points_where_planets_are(frames):
+    ax = replace(frames[0], position_angles=np.array([200.0])).plot()
     drawn = arrows(ax)
-    for letter, position_angle in (("N", 0.0), ("E", 90.0)):
-        expected = replace(PLANET, separation=1.0, position_angle=position_angle - angle).offset
+    for letter, angle in (("N", 0.0), ("E", 90.0)):
+        expected = replace(PLANET, separation=1.0, position_angle=angle - 200.0).offset
         np.testing.assert_allclose(drawn[letter], expected, atol=1e-12)
     # All of it is inside the axes.
     assert all(min(*each.xy, *each.xyann) > 0 for each in ax.texts)
@@ -162,23 +160,23 @@ def test_a_system_shows_its_pupils_and_the_star(model):
     for ax in (pupil, wavefront, last):
         np.testing.assert_allclose(ax.images[0].get_extent(), 3.3 * np.array([-1, 1, -1, 1]), 0.02)
     # The optical axis lies beside the middle of the detector.
-    np.testing.assert_allclose(
-        (place_of(image, 0, 0) + place_of(image, 29, 33)) / 2, -np.array(AXIS), atol=1e-12
-    )
-    labels = [bar_of(ax).get_ylabel() for ax in axes]
-    assert labels == [
-        "amplitude",
-        "wavefront error (nm)",
-        "light, 1 in the first pupil",
+    middle = (place_of(image, 0, 0) + place_of(image, 29, 33)) / 2
+    np.testing.assert_allclose(middle, -np.array(AXIS), atol=1e-12)
+    assert [label_of(ax) for ax in axes] == [
+        "amplitude", "wavefront error (nm)", "light, 1 in the first pupil",
         "fraction of the star's light",
-    ]
+    ]  # fmt: skip
     assert image.images[0].norm.vmin == pytest.approx(1e-6 * float(model(opd).max()))
 
 
-@pytest.mark.parametrize("frame", [0, 1])
-def test_a_fit_shows_data_star_and_what_is_left(fit, frame):
-    part = fit.frames[frame]
-    data, star, residual = axes = fit.plot(frame=frame)
+def test_a_fit_shows_data_star_and_what_is_left(fit):
+    part = fit.frames[1]
+    _, given = pyplot.subplots(1, 3)
+    data, star, residual = axes = fit.plot(given, frame=1)
+    assert axes.tolist() == given.tolist()
+    assert len(pyplot.get_fignums()) == 1
+    with pytest.raises(IncompatibleSetupError, match=r"got 2 axes, expected 3"):
+        fit.plot(given[:2])
     valid = part.observation.valid[0]
     # A mean of one integration is rounded.
     np.testing.assert_allclose(shown(data)[valid], part.observation.data[0][valid], rtol=1e-14)
@@ -188,20 +186,19 @@ def test_a_fit_shows_data_star_and_what_is_left(fit, frame):
     # One scale for both, or they could not be compared.
     assert data.images[0].norm is star.images[0].norm
     assert residual.images[0].get_clim() == (-5, 5)
-    assert [bar_of(ax).get_ylabel() for ax in axes] == ["photon", "photon", "standard deviations"]
+    assert [label_of(ax) for ax in axes] == ["photon", "photon", "standard deviations"]
     # The circle is where the companion's light is, in this frame and from this star.
     row, column = np.unravel_index(np.argmax(part.companion_image), part.star.shape)
     (place,) = points(residual, "companions")
     assert np.abs(place - place_of(residual, row, column)).max() < 0.07
-    turned = replace(PLANET, position_angle=PLANET.position_angle - ANGLES[frame])
-    np.testing.assert_allclose(place, turned.offset, atol=0.01)
+    np.testing.assert_allclose(place, in_frame(ANGLES[1]).offset, atol=0.01)
     middle = (place_of(data, 0, 0) + place_of(data, 29, 33)) / 2
     np.testing.assert_allclose(middle, -np.add(AXIS, OFFSET), atol=0.01)
-    expected = np.sin(np.deg2rad([ANGLES[frame], 90 - ANGLES[frame]]))
-    np.testing.assert_allclose(arrows(data)["N"], expected)
+    np.testing.assert_allclose(arrows(data)["N"], north(ANGLES[1]))
 
 
-def test_a_detection_shows_candidates_and_the_curve(found):
+def test_a_detection_shows_candidates_and_the_curve(fit):
+    found = dr.detect(fit)
     left, right = found.plot()
     np.testing.assert_array_equal(shown(left), found.snr)
     np.testing.assert_allclose(place_of(left, 4, 7), found.grid[4, 7], atol=1e-12)
@@ -212,25 +209,15 @@ def test_a_detection_shows_candidates_and_the_curve(found):
     assert np.abs(circled[0] - found.grid[peak]).max() < 0.07
     assert f"S/N {row['snr']:.1f}" in [each.get_text() for each in left.texts]
     assert left.get_title(loc="left") == "1 candidate above S/N 5"
-    assert bar_of(left).get_ylabel() == "S/N of a point source"
-    expected = np.sin(np.deg2rad([ANGLES[0], 90 - ANGLES[0]]))
-    np.testing.assert_allclose(arrows(left)["N"], expected)
+    assert label_of(left) == "S/N of a point source"
+    np.testing.assert_allclose(arrows(left)["N"], north(ANGLES[0]))
     curve = found.contrast_curve
     for label, name in (("median", "contrast"), ("star known exactly", "known_star")):
         drawn = points(right, label)
         np.testing.assert_array_equal(drawn[:, 0], curve["separation"].value)
         np.testing.assert_array_equal(drawn[:, 1], curve[name])
     assert right.get_yscale() == "log"
-    assert right.get_xlabel() == "separation (arcsec)"
     assert right.get_ylabel() == "contrast at 5 sigma"
-
-
-def test_axes_that_were_given_are_taken(fit):
-    _, given = pyplot.subplots(1, 3)
-    assert fit.plot(given).tolist() == given.tolist()
-    assert len(pyplot.get_fignums()) == 1
-    with pytest.raises(IncompatibleSetupError, match=r"got 2 axes, expected 3"):
-        fit.plot(given[:2])
 
 
 def test_ellipses_of_a_corner_are_those_of_the_covariance():
