@@ -166,20 +166,16 @@ def test_where_the_model_is_linearised_does_not_matter(single):
     residual = torch.where(part.weight > 0, part.residual - change, 0.0)
     other = replace(single, frames=(replace(part, residual=residual),), vector=moved)
     templates = {0: random(3, NY, NX, seed=50)}
-    torch.testing.assert_close(
-        other.weigh(templates).numerator, single.weigh(templates).numerator, rtol=1e-5, atol=1e-5
-    )
+    there, here = other.weigh(templates).numerator, single.weigh(templates).numerator
+    torch.testing.assert_close(there, here, rtol=1e-5, atol=1e-5)
 
 
 def test_light_of_a_million_standard_deviations_leaves_no_rounding_errors(single):
     """The light is a multiple of derivatives, so that nothing of it is left."""
     (part,) = single.frames
     light = 1e6 * part.jacobian.double().sum(dim=0) * (part.weight > 0)
-    bright = replace(
-        single,
-        frames=(replace(part, residual=light),),
-        deviation=torch.full_like(single.deviation, torch.inf),
-    )
+    infinite = torch.full_like(single.deviation, torch.inf)
+    bright = replace(single, frames=(replace(part, residual=light),), deviation=infinite)
     # The normal equations in double precision keep 1e-16 times their condition number; single
     # precision would leave 0.1.
     assert bright.cleaned[0].abs().max() < 1e-4

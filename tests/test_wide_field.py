@@ -52,7 +52,6 @@ def searched():
     fit = dr.refine(fitted, cut, opd, settings=settings)
     # As in `reduce`, once more without the light of the sources beyond the fitted pixels.
     cleaned = wide_field(dr.detect(fit), frames).subtracted(frames, cut)
-    assert cleaned is not None
     detection = dr.detect(dr.refine(fitted, cleaned, opd, settings=settings))
     return detection, frames, wide_field(detection, frames)
 

@@ -94,7 +94,6 @@ def _gradient(model, opd):
     weight = torch.rand(32, 32, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     variable = opd.clone().requires_grad_()
     (model(variable) * weight).sum().backward()
-    assert variable.grad is not None
     return variable.grad
 
 
@@ -157,7 +156,6 @@ def chi2_gradient(nanometres, dtype):
     for kind in (torch.float64, dtype):
         variable = opd.clone().requires_grad_()
         _chi2(kind, variable).backward()
-        assert variable.grad is not None
         gradients.append(variable.grad)
     if dtype == torch.float32:
         return distance(gradients[1], gradients[0])
