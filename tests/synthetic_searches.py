@@ -1,14 +1,11 @@
 """Searches of frames that were never fitted: maps of smooth noise with sources in them."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import torch
 from astropy.io import fits
 from astropy.table import QTable
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from pyklip_diffrender.detection import Candidates, Detection
@@ -25,36 +22,19 @@ RESOLUTION = 0.14
 CURVATURE = 1 / (2 * (SMOOTH * PIXEL) ** 2)
 """Of the autocorrelation, per arcsec^2."""
 
-Image = NDArray[np.float64]
-
 
 def noise(seed, side):
     """Smooth noise of standard deviation 1, (side, side)."""
     white = np.random.default_rng(seed).normal(size=(side + 20, side + 20))
-    smooth = gaussian_filter(white, SMOOTH, mode="wrap")
-    # The sum of the squares of the kernel, far from the edge of an impulse's image.
-    impulse = np.zeros((41, 41))
-    impulse[20, 20] = 1.0
-    kernel = gaussian_filter(impulse, SMOOTH)
-    return np.asarray(smooth[10:-10, 10:-10] / np.sqrt((kernel**2).sum()))
+    # The sum of the squares of the kernel is 1 / (4 pi SMOOTH^2).
+    smooth = 2 * np.sqrt(np.pi) * SMOOTH * gaussian_filter(white, SMOOTH, mode="wrap")
+    return smooth[10:-10, 10:-10]
 
 
 def searched(
-    filter="F444W",
-    seed=0,
-    sources=(),
-    *,
-    mjd=60000.0,
-    north=0.0,
-    error=1e-6,
-    side=41,
-    star=1.0,
-    status="CONVERGED",
-    header=None,
-    known=False,
-    freedom=np.inf,
-    factor=1.0,
-):
+    filter="F444W", seed=0, sources=(), *, mjd=60000.0, north=0.0, error=1e-6, side=41, star=1.0,
+    status="CONVERGED", header=None, known=False, freedom=np.inf, factor=1.0,
+):  # fmt: skip
     """A detection whose map has noise, and sources of an S/N at offsets to the east and north.
 
     With `known`, the sources are candidates of the search itself.

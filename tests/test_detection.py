@@ -1,106 +1,42 @@
 """Detection on a small system: calibrated, unbiased, and honest where the model is wrong."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import math
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from astropy import units as u
-from astropy.coordinates import SkyCoord
 from astropy.io import fits as astropy_fits
 from astropy.table import QTable
 from astropy.time import Time
 from astropy.units import Unit
 from astropy.wcs import WCS
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from noisy_stars import drift, drifted_star
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.detection.candidates import with_companions
-from pyklip_diffrender.errors import (
-    CorruptFileError,
-    DiffrenderError,
-    IncompatibleSetupError,
-)
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.linear.model import Unknown
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine
-from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.product_headers import world_coordinates
-from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.refinement import Status
+from pyklip_diffrender.scene import Planet, world_coordinates
+from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 FLUX = 3e11
-READ_NOISE = 42.0
 WHERE = Planet(0.0, 0.7, 60.0)
 FAINT = replace(WHERE, contrast=2e-6)
 """Below the S/N at which the star is refined again."""
 
 
-Image = NDArray[np.float64]
-
-
-@dataclass
-class World:
-    """A model, an old wavefront and a later one; fits and detections are made once."""
-
-    model: OpticalSystem
-    opd: Image
-    later: Image
-    basis: JointBasis
-    _made: dict[object, Refinement | Detection] = field(default_factory=dict, init=False)
-
-    def expected(self, *planets, offset=(0.0, 0.0)):
-        """Expected photons of star and planets."""
-        total = FLUX * self.model(self.later, offset).numpy()
-        for planet in planets:
-            place = tuple(np.add(offset, planet.offset))
-            total = total + planet.contrast * FLUX * self.model(self.later, place).numpy()
-        return total
-
-    def observed(self, expected, seed, **details):
-        rng = np.random.default_rng(seed)
-        counts = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
-        error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
-        scale = self.model.detector.pixelscale
-        return Observation.from_arrays(counts, error, pixelscale=scale, **details)
-
-    def fitted(self, seed, *planets, **changes):
-        key = ("fit", seed, planets, tuple(sorted(changes.items())))
-        if key not in self._made:
-            observation = self.observed(self.expected(*planets), seed)
-            self._made[key] = self.refined(observation, **changes)
-        return self._made[key]
-
-    def detected(self, seed, *planets, **changes):
-        key = ("detection", seed, planets, tuple(sorted(changes.items())))
-        if key not in self._made:
-            self._made[key] = dr.detect(self.fitted(seed, *planets, **changes))
-        return self._made[key]
-
-    def refined(self, observation, **changes):
-        settings = GaussNewton(**{"basis": self.basis, "response_npix": self.model.npix, **changes})
-        return refine(self.model, observation, self.opd, settings=settings)
-
-
-def drifted(npix, size, cycles):
-    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=npix, fov_pixels=size)
+def drifted(npix, size, cycles, segments=2.0, seed=1, flux=FLUX):
     basis = JointBasis([SegmentMotions(), FourierModes(cycles)])
-    opd = random_opd(3, npix=npix).data
-    generator = torch.Generator().manual_seed(1)
-    deviation = 1e-9 * torch.where(basis.frequencies == 0, 2.0, 0.15)
-    change = deviation * torch.randn(len(basis), dtype=torch.float64, generator=generator)
-    return World(model, opd, opd + basis.opd(change, PupilGrid.full(npix)).numpy(), basis)
+    return drifted_star(npix, size, basis, segments, 0.15, seed, flux)
 
 
 @pytest.fixture(scope="module")
@@ -116,26 +52,17 @@ def large():
 
 
 @pytest.fixture(scope="module")
-def empty(world):
-    """Three frames without a planet."""
-    return [world.detected(seed) for seed in range(3)]
-
-
-@pytest.fixture(scope="module")
 def one(world):
     """A planet of S/N 44 or so."""
     return world.detected(11, replace(WHERE, contrast=1e-5))
 
 
 def radius(found):
-    return np.asarray(np.hypot(found.grid[..., 0], found.grid[..., 1]))
+    return np.hypot(found.grid[..., 0], found.grid[..., 1])
 
 
-@pytest.mark.parametrize(
-    ("size", "count"), [("world", 3), pytest.param("large", 6, marks=pytest.mark.study)]
-)
-def test_snr_scatters_by_one_where_there_is_nothing(request, size, count):
-    empty = [request.getfixturevalue(size).detected(seed) for seed in range(count)]
+def test_snr_scatters_by_one_where_there_is_nothing(world):
+    empty = [world.detected(seed) for seed in range(3)]
     inside = radius(empty[0]) > 0.25
     values = np.concatenate([found.snr[inside] for found in empty])
     # Some 40 independent positions a frame: the deviation of three is known to 7 %.
@@ -144,75 +71,37 @@ def test_snr_scatters_by_one_where_there_is_nothing(request, size, count):
     # chi2 of a thousand pixels is known to 4.5 %.
     assert all(1.0 <= found.scatter < 1.06 for found in empty)
     assert all(len(found.sources) == 0 for found in empty)
-
-
-def test_the_freedom_of_the_wavefront_costs_something_everywhere(empty):
-    ratio = empty[0].error / empty[0].photon_error
-    seen = radius(empty[0]) > 0.25
-    assert ratio[seen].min() > 1.0
-    assert 1.02 < np.median(ratio[seen]) < 2.0
-
-
-FEW = JointBasis([SegmentMotions(), FourierModes(4)])
-
-
-@cache
-def small():
-    """A system whose fits take less than a second, and an old wavefront."""
-    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=32)
-    return model, random_opd(3, npix=64).data
-
-
-@cache
-def pulls(seed):
-    """Errors of a planet's contrast, x and y over those stated; new wavefront, place and noise.
-
-    None for the position of a planet that is not above the threshold.
-    """
-    model, opd = small()
-    generator = torch.Generator().manual_seed(seed)
-    size = torch.where(FEW.frequencies == 0, 1.0, 0.15)
-    change = torch.randn(len(FEW), dtype=torch.float64, generator=generator) * size * 1e-9
-    later = opd + FEW.opd(change, PupilGrid.full(64)).numpy()
-    flux, planet = 3e10, Planet(1.2e-5, 0.5 + 0.1 * (seed % 4), 47.0 * seed)
-    world = World(model, opd, later, JointBasis([FEW]))
-    frame = world.observed(flux / FLUX * world.expected(planet), seed)
-    fit = refine(model, frame, opd, settings=GaussNewton(basis=FEW, response_npix=64))
-    found = dr.detect(fit)
-    row = found.measure([planet.offset])[0]
-    contrast = float((row["contrast"] - planet.contrast) / row["contrast_error"])
-    if len(found.candidates) != 1:
-        return contrast, None, None
-    there = found.candidates[0]
-    x, y = (
-        float((there[axis].value - true) / there[f"{axis}_error"].value)
-        for axis, true in zip("xy", planet.offset, strict=True)
-    )
-    return contrast, x, y
+    # The freedom of the wavefront costs something everywhere.
+    ratio = (empty[0].error / empty[0].photon_error)[inside]
+    assert ratio.min() > 1.0
+    assert 1.02 < np.median(ratio) < 2.0
 
 
 @pytest.mark.slow
 def test_contrast_and_place_of_planets_are_unbiased_and_their_errors_right():
-    """Errors that are wrong by a factor of 1.4 do not pass.
+    """New wavefront, place and noise 32 times; errors wrong by a factor of 1.4 do not pass.
 
     The deviation of 32 pulls is known to 13 %, of 64 to 9 %.
     """
-    count, within = 32, 1.4**0.5
-    contrast, x, y = zip(*(pulls(seed) for seed in range(count)), strict=True)
-    places = np.array([pull for pull in (*x, *y) if pull is not None])
-    assert len(places) > 1.7 * count
-    for drawn in (np.array(contrast), places):
-        assert abs(drawn.mean()) < 3 / len(drawn) ** 0.5
-        assert 1 / within < drawn.std() < within
+    contrasts, places = [], []
+    for seed in range(32):
+        world = drifted(64, 32, 4, segments=1.0, seed=seed, flux=3e10)
+        planet = Planet(1.2e-5, 0.5 + 0.1 * (seed % 4), 47.0 * seed)
+        found = world.detected(seed, planet)
+        row = found.measure([planet.offset])[0]
+        contrasts.append((row["contrast"] - planet.contrast) / row["contrast_error"])
+        if len(found.candidates) == 1:  # Else it is not above the threshold.
+            (row,) = found.candidates
+            for axis, true in zip("xy", planet.offset, strict=True):
+                places.append((row[axis].value - true) / row[f"{axis}_error"].value)
+    assert len(places) > 1.7 * 32
+    for pulls in (np.array(contrasts), np.array(places)):
+        assert abs(pulls.mean()) < 3 / len(pulls) ** 0.5
+        assert 1.4**-0.5 < pulls.std() < 1.4**0.5
 
 
 @pytest.mark.parametrize(
-    ("size", "contrast"),
-    [
-        ("world", 1e-3),
-        pytest.param("large", 2e-5, marks=pytest.mark.slow),
-        pytest.param("large", 1e-3, marks=pytest.mark.slow),
-    ],
+    ("size", "contrast"), [("world", 1e-3), pytest.param("large", 2e-5, marks=pytest.mark.slow)]
 )
 def test_a_bright_companion_gets_parameters_of_its_own(request, size, contrast):
     """Without them the wavefront bends to it, and nothing converges."""
@@ -225,14 +114,6 @@ def test_a_bright_companion_gets_parameters_of_its_own(request, size, contrast):
     assert measured[0] == pytest.approx(contrast, rel=0.02, abs=4 * error[0])
     assert measured[1:] == pytest.approx(planet.offset, abs=0.005)
     assert fit.frames[0].star == pytest.approx(world.expected(), rel=0.02, abs=100)
-
-
-@pytest.mark.slow
-def test_what_a_fit_took_for_a_companion_need_not_be_one(world):
-    observation = world.observed(world.expected(), 4)
-    fit = world.refined(observation, companions=(replace(WHERE, contrast=1e-6),))
-    assert len(fit.companions) == 1
-    assert len(dr.detect(fit).candidates) == 0
 
 
 def test_a_prior_that_is_held_too_narrow_is_widened(world):
@@ -261,19 +142,16 @@ def test_a_prior_that_is_held_too_narrow_is_widened(world):
 
 
 def test_the_prior_of_the_amplitude_is_widened_as_well(world):
-    absorbing = 6e-9 * torch.randn(
-        len(world.basis), dtype=torch.float64, generator=torch.Generator().manual_seed(2)
-    )
-    absorbing *= world.basis.frequencies > 0
-    grid = PupilGrid.full(world.model.npix)
-    later = torch.from_numpy(world.later) + 1j * world.basis.opd(absorbing, grid)
+    absorbing = drift(world.basis, world.model.npix, 0.0, 6.0, 2)
+    later = torch.from_numpy(world.later + 1j * absorbing)
     observation = world.observed(FLUX * world.model(later).numpy(), 4)
     narrow = WavefrontPrior(
         {"segment": 0.7, "texture": 0.1}, fit_scales=False,
         amplitude_cycles=4.0, amplitude_scale=2.0, amplitude_slope=0.0,
     )  # fmt: skip
-    before = world.refined(observation, prior=narrow)
-    fit = world.refined(observation, prior=narrow, widen_prior=True)
+    before, fit = (
+        world.refined(observation, prior=narrow, widen_prior=each) for each in (False, True)
+    )
     assert before.status is Status.PRIOR_MISMATCH
     assert before.prior_ratios["amplitude"] > 3
     assert fit.status is Status.CONVERGED
@@ -283,17 +161,16 @@ def test_the_prior_of_the_amplitude_is_widened_as_well(world):
 
 
 def test_a_planet_does_not_make_the_noise_larger(world):
-    planet = FAINT
-    quiet, fit = world.fitted(5), world.fitted(5, planet)
-    noise, found = world.detected(5), world.detected(5, planet)
+    quiet, fit = world.fitted(5), world.fitted(5, FAINT)
+    noise, found = world.detected(5), world.detected(5, FAINT)
     assert len(found.sources) == 1
     assert len(fit.companions) == 0
     # Its light would be structure that no mode explains.
     assert fit.reduced_chi2 > 1.06 * quiet.reduced_chi2
     assert found.scatter == pytest.approx(noise.scatter, rel=0.01)
     # The same where positions are given, once or more often.
-    once, thrice = (dr.measure(fit, [planet.offset] * count) for count in (1, 3))
-    assert found.measure([planet.offset])["snr"] == pytest.approx(once["snr"], rel=0.01)
+    once, thrice = (dr.measure(fit, [WHERE.offset] * count) for count in (1, 3))
+    assert found.measure([WHERE.offset])["snr"] == pytest.approx(once["snr"], rel=0.01)
     assert thrice["snr"].tolist() == pytest.approx([once["snr"][0]] * 3, rel=1e-4)
 
 
@@ -303,24 +180,8 @@ def test_weights_for_outliers_do_not_hide_structure(world):
     assert dr.detect(fit).scatter == pytest.approx(math.sqrt(fit.reduced_chi2), rel=1e-6)
 
 
-@pytest.mark.slow
-def test_a_model_that_is_wrong_inflates_the_errors(world):
-    """A wavefront that moved more than the prior allows at frequencies that are not fitted."""
-    rough = FourierModes(12.0, 7.0)
-    generator = torch.Generator().manual_seed(5)
-    change = torch.randn(len(rough), dtype=torch.float64, generator=generator) * 2e-9
-    moved = world.later + rough.opd(change, PupilGrid.full(world.model.npix)).numpy()
-    other = replace(world, later=moved)
-    fit = other.fitted(3)
-    assert fit.status is Status.MODEL_MISMATCH
-    found = dr.detect(fit, threshold=math.inf)
-    assert found.scatter >= 1.0
-    assert found.snr[radius(found) > 0.25].std() < 1.3
-
-
 def test_a_planet_is_found_where_it_is(one):
-    assert len(one.sources) == 1
-    row = one.candidates[0]
+    (row,) = one.candidates
     for axis, true in zip("xy", WHERE.offset, strict=True):
         error = row[f"{axis}_error"].to_value("arcsec")
         assert 0 < error < 0.02
@@ -328,28 +189,19 @@ def test_a_planet_is_found_where_it_is(one):
     assert abs(row["contrast"] - 1e-5) < 4 * row["contrast_error"]
     assert row["separation"].to_value("arcsec") == pytest.approx(0.7, abs=0.02)
     assert row["position_angle"].to_value("deg") == pytest.approx(60.0, abs=2.0)
-    assert row["snr"] > 8
+    # It is gone from the map without candidates.
+    near = np.hypot(*np.moveaxis(one.grid - WHERE.offset, -1, 0)) < 0.15
+    assert one.snr[near].max() > 8
+    assert np.abs(one.residual_snr[near]).max() < 3.5
 
 
 def test_a_candidate_has_the_signal_to_noise_of_the_map_where_it_is(world):
     """Near the mask, the uncertain position adds to the error of the contrast, but not here."""
-    near = dr.Planet(6e-5, 0.3, 60.0)
-    found = world.detected(5, near)
+    found = world.detected(5, Planet(6e-5, 0.3, 60.0))
     assert len(found.sources) == 1
     snr = found.candidates["snr"][0]
     assert snr == pytest.approx(found.measure(found.sources.offsets)["snr"][0], rel=1e-3)
     assert found.candidates["contrast"][0] / own_error(found) < 0.95 * snr
-
-
-def test_no_candidate_is_nearer_than_the_smallest_separation(world):
-    """The same S/N, by which the planet was found, counts for nothing inside it."""
-    found = world.detected(5, FAINT)
-    assert len(found.sources) == 1
-    assert len(found.fits[0].companions) == 0
-    beyond = dr.detect(found.fits, inner=0.8)
-    # Without the planet as a source the map keeps all of its light.
-    assert np.nanmax(beyond.snr[radius(beyond) < 0.8]) > 8
-    assert len(beyond.candidates) == 0
 
 
 @pytest.mark.parametrize(("inner", "candidates"), [(0.695, 1), (0.72, 0)])
@@ -359,12 +211,14 @@ def test_the_place_of_a_source_counts_and_not_that_of_its_pixel(world, inner, ca
     peak = np.unravel_index(np.nanargmax(found.snr), found.snr.shape)
     assert radius(found)[peak] == pytest.approx(0.685, abs=1e-3)
     assert len(found.candidates) == candidates
+    # Without the planet as a source the map keeps all of its light.
+    assert found.snr[peak] > 8
 
 
-def test_the_planet_is_gone_from_the_map_without_candidates(one):
-    near = np.hypot(one.grid[..., 0] - WHERE.offset[0], one.grid[..., 1] - WHERE.offset[1]) < 0.15
-    assert one.snr[near].max() > 8
-    assert np.abs(one.residual_snr[near]).max() < 3.5
+def own_error(found):
+    """The error of the first candidate's contrast without that of the calibration."""
+    factor = found.error_factor.of(found.sources.offsets)
+    return float(factor[0] * found.sources.errors[0, 0])
 
 
 def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world):
@@ -379,12 +233,6 @@ def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world):
     assert expected > (1 + 1e-6) * row["contrast"] / row["snr"]
     # And what makes all errors larger makes this one larger.
     assert scaled["contrast_error"] == pytest.approx(2 * row["contrast_error"], rel=1e-8)
-
-
-def own_error(found):
-    """The error of the first candidate's contrast without that of the calibration."""
-    factor = found.error_factor.of(found.sources.offsets)
-    return float(factor[0] * found.sources.errors[0, 0])
 
 
 @pytest.mark.slow
@@ -417,8 +265,7 @@ def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_exte
     world, monkeypatch, caplog
 ):
     """Two of three planets, with S/N that would be worth another fit of the star."""
-    planets = [Planet(1e-5, 0.6, angle) for angle in (0.0, 120.0, 240.0)]
-    fit = world.fitted(5, *planets)
+    fit = world.fitted(5, *(Planet(1e-5, 0.6, angle) for angle in (0.0, 120.0, 240.0)))
     monkeypatch.setattr("pyklip_diffrender.detection.search._MAX_CANDIDATES", 2)
     with caplog.at_level(logging.WARNING, "pyklip_diffrender"):
         found = dr.detect(fit, relinearise=5.0, scatter=1.0)
@@ -430,23 +277,22 @@ def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_exte
 @pytest.mark.slow
 def test_two_planets_closer_than_a_beam_are_fitted_together(large):
     pair = (Planet(1.5e-4, 0.80, 60.0), Planet(1e-4, 0.80, 51.0))
-    found = dr.detect(large.fitted(12, *pair))
-    assert len(found.sources) == 2
-    for planet in pair:
-        away = np.hypot(*(found.sources.offsets.numpy() - planet.offset).T)
-        nearest = int(np.argmin(away))
-        assert away[nearest] < 0.02
-        contrast = float(found.sources.contrasts[nearest])
-        assert abs(contrast - planet.contrast) < 4 * float(found.sources.errors[nearest, 0])
-        assert contrast == pytest.approx(planet.contrast, rel=0.3)
+    found = large.detected(12, *pair)
+    sources = found.sources
+    assert len(sources) == 2
+    order = np.argsort(-sources.contrasts.numpy())
+    away = sources.offsets.numpy()[order] - [planet.offset for planet in pair]
+    assert np.hypot(*away.T).max() < 0.02
+    contrasts, true = sources.contrasts.numpy()[order], [planet.contrast for planet in pair]
+    assert (abs(contrasts - true) < 4 * sources.errors.numpy()[order, 0]).all()
+    assert contrasts == pytest.approx(true, rel=0.3)
 
 
 @pytest.mark.slow
 def test_a_bright_ring_keeps_its_light(large):
     """Of known shape, though no wavefront explains it; what is merely subtracted loses some."""
-    angles = np.arange(0, 360, 9.0)
-    places = [Planet(1.0, 0.75, angle).offset for angle in angles]
-    light = sum(large.model(large.later, place).numpy() for place in places) * FLUX / len(places)
+    ring = [Planet(1 / 40, 0.75, angle) for angle in np.arange(0, 360, 9.0)]
+    light = sum(large.light(part) for part in ring)
     observation = large.observed(large.expected() + 1e-4 * light, 17)
     fit = large.refined(observation)
     assert fit.status is not Status.CONVERGED
@@ -455,13 +301,6 @@ def test_a_bright_ring_keeps_its_light(large):
     assert error < 0.05
     weight = light / observation.error[0] ** 2
     assert (weight * fit.frames[0].residual[0]).sum() / (weight * 1e-4 * light).sum() < 0.95
-
-
-@pytest.mark.slow
-def test_a_planet_on_the_edge_of_the_field_is_measured(large):
-    planet = Planet(1e-4, 1.2, 90.0)
-    table = dr.measure(large.fitted(14, planet), [planet.offset])
-    assert abs(float(table["contrast"][0]) - 1e-4) < 4 * float(table["contrast_error"][0])
 
 
 @pytest.mark.slow
@@ -505,28 +344,23 @@ def test_rolled_frames_share_the_star_and_turn_the_planet(world):
     ]
     together = world.refined(frames)
     apart = [world.fitted(5, FAINT), world.refined(frames[1])]
-    joint = dr.measure(together, [FAINT.offset])
     # The frame of the first one is as it would be without an angle: the angles' difference counts.
-    origin = replace(apart[0].frames[0], observation=frames[0])
-    apart[0] = replace(apart[0], frames=(origin,))
-    separate = dr.measure(apart, [FAINT.offset])
-    for table in (joint, separate):
-        away = abs(float(table["contrast"][0]) - FAINT.contrast)
-        assert away < 4 * float(table["contrast_error"][0])
-    assert joint["contrast_error"][0] < separate["contrast_error"][0]
-    wrong = dr.measure(together, [replace(FAINT, position_angle=70.0).offset])
-    assert float(wrong["snr"][0]) < 0.6 * float(joint["snr"][0])
+    apart[0] = replace(apart[0], frames=(replace(apart[0].frames[0], observation=frames[0]),))
+    joint, separate = (dr.measure(each, [FAINT.offset])[0] for each in (together, apart))
+    for row in (joint, separate):
+        assert abs(row["contrast"] - FAINT.contrast) < 4 * row["contrast_error"]
+    assert joint["contrast_error"] < separate["contrast_error"]
+    (wrong,) = dr.measure(together, [replace(FAINT, position_angle=70.0).offset])
+    assert wrong["snr"] < 0.6 * joint["snr"]
 
 
 def test_a_reference_star_helps_and_shows_no_planet(world):
     target = world.observed(world.expected(FAINT), 5)
     reference = replace(world.observed(4 * world.expected(), 41), reference=True)
     fit = world.refined([target, reference])
-    alone = dr.measure(world.fitted(5, FAINT), [FAINT.offset])
-    both = dr.measure(fit, [FAINT.offset])
-    away = abs(float(both["contrast"][0]) - FAINT.contrast)
-    assert away < 4 * float(both["contrast_error"][0])
-    assert both["contrast_error"][0] < 0.99 * alone["contrast_error"][0]
+    alone, both = (dr.measure(each, [FAINT.offset])[0] for each in (world.fitted(5, FAINT), fit))
+    assert abs(both["contrast"] - FAINT.contrast) < 4 * both["contrast_error"]
+    assert both["contrast_error"] < 0.99 * alone["contrast_error"]
     with pytest.raises(IncompatibleSetupError, match="reference star"):
         dr.detect(replace(fit, frames=fit.frames[::-1]))
 
@@ -549,53 +383,31 @@ def test_dithered_frames_have_star_positions_of_their_own(world):
 
 
 def test_snapshots_may_drift_apart_by_what_the_prior_allows(world):
-    generator = torch.Generator().manual_seed(8)
-    change = torch.zeros(len(world.basis), dtype=torch.float64)
-    change[:54] = 1e-9 * torch.randn(54, dtype=torch.float64, generator=generator)
-    drift = world.basis.opd(change, PupilGrid.full(world.model.npix)).numpy()
-    moved = replace(world, later=world.later + drift)
+    later = world.later + drift(world.basis, world.model.npix, 1.0, 0.0, 8)
+    moved = replace(world, later=later)
     frames = [world.observed(world.expected(), 60), moved.observed(moved.expected(), 61)]
     linked = world.refined(
         frames, drift=WavefrontPrior(scales={"segment": 0.5, "texture": 0.02}), drift_cycles=2.0
     )
-    shared = world.refined(frames)
-    assert linked.chi2_per_pixel < 0.8 * shared.chi2_per_pixel
+    assert linked.chi2_per_pixel < 0.8 * world.refined(frames).chi2_per_pixel
     assert linked.chi2_per_pixel < 1.2
     assert linked.scales["segment drift"] == pytest.approx(0.7, abs=0.35)
-    apart = linked.frames[1].opd - linked.frames[0].opd
-    assert np.std(apart) > 0.2e-9
+    assert np.std(linked.frames[1].opd - linked.frames[0].opd) > 0.2e-9
 
 
-def test_the_contrast_curve_is_five_times_the_error_of_the_map(world, empty):
-    table = empty[0].contrast_curve
-    assert set(table.colnames) >= {"separation", "contrast", "known_star", "small_sample"}
+def test_the_contrast_curve_is_five_times_the_error_of_the_map(world):
+    table = world.detected(0).contrast_curve
     assert (np.diff(table["separation"].to_value("arcsec")) > 0).all()
     assert (table["contrast"] > table["known_star"]).all()
     assert (table["lowest"] <= table["contrast"]).all()
     assert (table["highest"] >= table["contrast"]).all()
-    quick = dr.contrast_curve(empty[0].fits[0], separations=[0.5, 0.8], angles=200)
+    quick = dr.contrast_curve(world.fitted(0), separations=[0.5, 0.8], angles=200)
     for row in quick:
         k = int(np.argmin(np.abs(table["separation"] - row["separation"])))
         assert row["contrast"] == pytest.approx(table["contrast"][k], rel=1e-6)
-
-
-def test_products_can_be_read_by_others(one, tmp_path):
-    paths = one.write(tmp_path / "products")
-    assert [path.name for path in paths] == ["detection.fits", "candidates.ecsv", "contrast.ecsv"]
-    with astropy_fits.open(paths[0], checksum=True) as hdus:
-        np.testing.assert_allclose(hdus["SNR"].data, one.snr, rtol=1e-6)
-        assert hdus["OFFSET_X"].header["BUNIT"] == "arcsec"
-        np.testing.assert_allclose(hdus["SUBTRACTED", 1].data, one.subtracted[0], rtol=1e-6)
-        assert Unit(hdus["SUBTRACTED"].header["BUNIT"]) == Unit("photon")
-        assert hdus[0].header["DRSTAT"] == "CONVERGED"
-        assert hdus[0].header["DRVERS"] == dr.__version__
-        # astropy warns of checksums that do not hold, and warnings are errors.
-        assert all(hdu.verify_checksum() == hdu.verify_datasum() == 1 for hdu in hdus)
-    table = QTable.read(paths[1], format="ascii.ecsv")
-    assert table["separation"].unit == "arcsec"
-    assert table.meta["scatter"] == one.scatter
-    curve = QTable.read(paths[2], format="ascii.ecsv")
-    assert len(curve) == len(one.contrast_curve)
+    # What is partly outside the field has rows for the part inside.
+    partly = dr.contrast_curve(world.fitted(0), [500.0, 5000.0] * u.mas)
+    assert partly["separation"].to_value("arcsec").tolist() == [0.5]
 
 
 def oriented(found):
@@ -608,17 +420,10 @@ def oriented(found):
     return replace(found, fits=(replace(fit, frames=(replace(frame, observation=observation),)),))
 
 
-def test_the_images_are_on_the_sky_where_the_table_says(one, tmp_path):
+def test_all_images_are_on_the_sky_where_the_maps_are(one, tmp_path):
     found = oriented(one)
-    planet = found.candidates[0]
-    # The nearest pixel, and from there the rest of the way.
-    nearest = (np.hypot(found.grid[..., 0] - planet["x"].value,
-                        found.grid[..., 1] - planet["y"].value)).argmin()  # fmt: skip
-    row, column = np.unravel_index(nearest, found.snr.shape)
-    step = (np.array([planet["x"].value, planet["y"].value]) - found.grid[row, column]) / (
-        found.observation.pixelscale
-    )
-    pixel = np.array([column, row]) + step
+    # Which `tests/test_sky.py` compares with the table.
+    expected = WCS(world_coordinates(found.grid, found.observation)).pixel_to_world(7, 3)
     maps, fit = found.write(tmp_path)[0], found.fits[0].write(tmp_path / "fit.fits", linear=False)
     images = {
         maps: ("SNR", "SUBTRACTED", "DATA"),
@@ -629,39 +434,44 @@ def test_the_images_are_on_the_sky_where_the_table_says(one, tmp_path):
             assert hdus[0].header["OBJECT"] == "HD 1"
             assert hdus[0].header["DRSTAT"] == "CONVERGED"
             for name in names:
-                wcs = WCS(hdus[name].header)
-                place = wcs.pixel_to_world(*pixel)
-                east, north = SkyCoord(311.3, -31.3, unit="deg").spherical_offsets_to(place)
-                assert east.arcsec == pytest.approx(planet["delta_ra"].value, abs=2e-4)
-                assert north.arcsec == pytest.approx(planet["delta_dec"].value, abs=2e-4)
+                place = WCS(hdus[name].header).pixel_to_world(7, 3)
+                assert place.separation(expected).arcsec < 1e-5
     with astropy_fits.open(fit) as hdus:
-        units = {name: Unit(hdus[name].header["BUNIT"]) for name in ("DATA", "ERROR", "STAR")}
-        assert set(units.values()) == {Unit("photon")}
+        units = {Unit(hdus[name].header["BUNIT"]) for name in ("DATA", "ERROR", "STAR")}
+        assert units == {Unit("photon")}
         assert "CTYPE1" not in hdus["OPD"].header
-
-
-def test_without_a_position_on_the_sky_the_coordinates_are_arcsec_from_the_star(one):
+    # Without a position on the sky the coordinates are arcsec from the star.
     wcs = WCS(world_coordinates(one.grid, one.observation))
     np.testing.assert_allclose(wcs.pixel_to_world_values(7, 3), one.grid[3, 7], atol=1e-9)
 
 
 def test_a_detection_survives_the_file(one, tmp_path):
     first = oriented(one)
-    again = Detection.read(first.write(tmp_path / "first")[0].parent)
-    for name in ("snr", "residual_snr", "contrast", "error", "photon_error", "grid"):
+    paths = first.write(tmp_path / "first")
+    names = ["detection.fits", "candidates.ecsv", "contrast.ecsv"]
+    assert [path.name for path in paths] == [*names, "astrometry.csv"]
+    with astropy_fits.open(paths[0], checksum=True) as hdus:
+        np.testing.assert_allclose(hdus["SNR"].data, one.snr, rtol=1e-6)
+        assert hdus["OFFSET_X"].header["BUNIT"] == "arcsec"
+        np.testing.assert_allclose(hdus["SUBTRACTED", 1].data, one.subtracted[0], rtol=1e-6)
+        assert Unit(hdus["SUBTRACTED"].header["BUNIT"]) == Unit("photon")
+        assert hdus[0].header["DRVERS"] == dr.__version__
+        # astropy warns of checksums that do not hold, and warnings are errors.
+        assert all(hdu.verify_checksum() == hdu.verify_datasum() == 1 for hdu in hdus)
+    table = QTable.read(paths[1], format="ascii.ecsv")
+    assert table["separation"].unit == "arcsec"
+    assert table.meta["scatter"] == one.scatter
+    again = Detection.read(paths[0].parent)
+    for name in ("snr", "residual_snr", "contrast", "error", "photon_error", "grid", "subtracted"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
-    for ours, theirs in zip(again.subtracted, first.subtracted, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
     assert [repr(again), str(again), again.scatter] == [repr(first), str(first), first.scatter]
-    for ours, theirs in (
-        (again.candidates, first.candidates),
-        (again.contrast_curve, first.contrast_curve),
-    ):
+    for name in ("candidates", "contrast_curve"):
+        ours, theirs = getattr(again, name), getattr(first, name)
         assert ours.meta == theirs.meta
         assert ours.colnames == theirs.colnames
-        for name in ours.colnames:
-            np.testing.assert_array_equal(ours[name], theirs[name])
-            assert ours[name].unit == theirs[name].unit
+        for column in ours.colnames:
+            np.testing.assert_array_equal(ours[column], theirs[column])
+            assert ours[column].unit == theirs[column].unit
     assert again.north == 33.0
     assert again.observation.date == first.observation.date
     assert again.observation.target == "HD 1"
@@ -670,9 +480,9 @@ def test_a_detection_survives_the_file(one, tmp_path):
     assert len(right.lines) == len(first.plot(Figure().subplots(1, 2))[1].lines)
     # A copy of a copy is the same file.
     again.write(tmp_path / "again")
-    for name in ("detection.fits", "candidates.ecsv", "contrast.ecsv"):
-        copy = (tmp_path / "again" / name).read_bytes()
-        assert copy == (tmp_path / "first" / name).read_bytes()
+    for name in names:
+        copies = [(tmp_path / folder / name).read_bytes() for folder in ("first", "again")]
+        assert copies[0] == copies[1]
 
 
 def test_a_detection_from_a_file_measures_with_its_fit(world, one, tmp_path):
@@ -695,12 +505,17 @@ def test_a_detection_from_a_file_measures_with_its_fit(world, one, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("FACTS", "no FACTS"), ("PHOTON_ERROR", "PHOTON_ERROR"), ("SNR", "shapes"), ("none", "such")],
-)
-def test_a_file_without_a_part_is_no_detection(empty, name, message, tmp_path):
-    path = empty[0].write(tmp_path)[0]
-    if name == "none":
+    [
+        ("FACTS", "no FACTS"), ("PHOTON_ERROR", "PHOTON_ERROR"), ("SNR", "shapes"),
+        ("no file", "such"), ("a fit", "not a complete Detection"),
+    ],
+)  # fmt: skip
+def test_a_file_without_a_part_is_no_detection(one, name, message, tmp_path):
+    path = one.write(tmp_path)[0]
+    if name == "no file":
         path.unlink()
+    elif name == "a fit":
+        path = one.fits[0].write(tmp_path / "fit.fits", linear=False)
     else:
         with astropy_fits.open(path) as hdus:
             if name == "SNR":
@@ -709,12 +524,6 @@ def test_a_file_without_a_part_is_no_detection(empty, name, message, tmp_path):
                 del hdus[name]
             hdus.writeto(path, overwrite=True, checksum=True)
     with pytest.raises(CorruptFileError, match=message):
-        Detection.read(path)
-
-
-def test_a_refinement_is_no_detection(one, tmp_path):
-    path = one.fits[0].write(tmp_path / "fit.fits", linear=False)
-    with pytest.raises(CorruptFileError, match="not a complete Detection"):
         Detection.read(path)
 
 
@@ -728,9 +537,8 @@ def kept(image, star, light, error):
 def test_a_frame_keeps_the_light_of_candidates(world):
     light = world.expected(FAINT) - world.expected()
     found = world.detected(5, FAINT)
-    assert len(found.sources) == 1
     fit = found.fits[0]
-    assert not len(fit.companions)
+    assert (len(found.sources), len(fit.companions)) == (1, 0)
     # What is left of the star and its noise, were it known.
     noise = fit.frames[0].observation.data[0] - world.expected() - light
     error = fit.frames[0].observation.error[0]
@@ -740,27 +548,20 @@ def test_a_frame_keeps_the_light_of_candidates(world):
     # A fit that has the planet from the start leaves the same.
     (renewed,) = with_companions(found.fits, found.sources)
     away = radius(found) > 0.25
-    difference = ((image - renewed.frames[0].residual[0]) / error)[away]
-    closed = ((fit.frames[0].residual[0] - renewed.frames[0].residual[0]) / error)[away]
-    assert difference.std() < 0.05
-    assert difference.std() < 0.2 * closed.std()
+    difference, closed = (
+        ((each - renewed.frames[0].residual[0]) / error)[away].std()
+        for each in (image, fit.frames[0].residual[0])
+    )
+    assert difference < min(0.05, 0.2 * closed)
 
 
 def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world):
     """The star is found in single precision once more; of 1e-3 that must not show."""
     found = world.detected(7, replace(WHERE, contrast=1e-3))
-    (fit,) = found.fits
-    assert len(fit.companions) == len(found.sources) == 1
-    difference = (found.subtracted[0] - fit.frames[0].residual[0]) / fit.frames[
-        0
-    ].observation.error[0]
+    assert len(found.fits[0].companions) == len(found.sources) == 1
+    (frame,) = found.fits[0].frames
+    difference = (found.subtracted[0] - frame.residual[0]) / frame.observation.error[0]
     assert difference[radius(found) > 0.25].std() < 0.05
-
-
-@pytest.fixture(scope="module")
-def reference(large):
-    """A brighter star, fitted on its own."""
-    return large.refined(replace(large.observed(4 * large.expected(), 72), reference=True))
 
 
 @pytest.mark.slow
@@ -786,70 +587,49 @@ def test_every_frame_is_subtracted_as_it_was_taken(large):
     np.testing.assert_allclose(apart.subtracted[1], apart.fits[1].frames[0].residual[0], atol=1e-9)
 
 
-def test_positions_may_have_a_unit(one):
+def test_positions_may_have_a_unit_and_are_in_the_field(one):
     plain = one.measure([[-0.485, 0.353]])
     for offsets in ([[-485, 353]] * u.mas, [[-0.485, 0.353]] * u.arcsec):
         for table in (one.measure(offsets), dr.measure(one.fits, offsets, scatter=one.scatter)):
             for name in plain.colnames:
                 np.testing.assert_allclose(table[name], plain[name], rtol=1e-12)
-
-
-def test_a_position_outside_the_field_is_refused(one):
-    """Such as one that somebody else calls arcsec, and means degrees or pixels."""
+    # Such as one that somebody else calls arcsec, and means degrees or pixels.
     corner = one.grid[0, 0]
     assert np.isfinite(one.measure([corner])["contrast"][0])
-    for far in (1.1 * corner, [[0.7, 0.35]] * u.deg, [0.0, -2.5], [-30.0, 5.0]):
-        with pytest.raises(IncompatibleSetupError, match=r"offsets: got .*from the star; .*u\.mas"):
-            one.measure(far)
-        with pytest.raises(IncompatibleSetupError, match="offsets"):
-            dr.measure(one.fits, far)
+    for far in (1.1 * corner, [[0.7, 0.35]] * u.deg, [-30.0, 5.0]):
+        for measure in (one.measure, lambda offsets: dr.measure(one.fits, offsets)):
+            with pytest.raises(IncompatibleSetupError, match=r"offsets: got .*the star; .*u\.mas"):
+                measure(far)
 
 
-REFUSED = [
-    (lambda one: dr.detect([]), "no fit"),
-    (lambda one: dr.detect(replace(one.fits[0], stored_linear=None)), "linear=False.*Fit the fra"),
-    (lambda one: one.measure([0.1, 0.2, 0.3]), r"\(k, 2\)"),
-    (lambda one: one.measure([[np.nan, 0.2]]), "offsets"),
-    (lambda one: one.measure([[1.0, 2.0]] * u.m), "offsets"),
-    (lambda one: dr.detect(one.fits, inner=1 * u.m), "inner"),
-]
-CALLS = {
-    "threshold: got": lambda fit, value: dr.detect(fit, threshold=value),
-    "inner: got": lambda fit, value: dr.detect(fit, inner=value),
-    "scatter: got": lambda fit, value: dr.detect(fit, scatter=value),
-    "separations: got": lambda fit, value: dr.detect(fit, separations=[0.5, value]),
-    "separations: got ": lambda fit, value: dr.contrast_curve(fit, [value]),
-    "scatter: got ": lambda fit, value: dr.contrast_curve(fit, [0.5], scatter=value),
-    "scatter: got.": lambda fit, value: dr.measure(fit, [[0.5, 0.5]], scatter=value),
-}
-
-
-@pytest.mark.parametrize(("call", "words"), REFUSED)
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda fit: dr.detect([]), "no fit"),
+        (lambda fit: dr.detect(replace(fit, stored_linear=None)), "linear=False.*Fit the fra"),
+        (lambda fit: dr.measure(fit, [0.1, 0.2, 0.3]), r"\(k, 2\)"),
+        (lambda fit: dr.measure(fit, [[np.nan, 0.2]]), "offsets"),
+        (lambda fit: dr.measure(fit, [[1.0, 2.0]] * u.m), "offsets"),
+        (lambda fit: dr.measure(fit, [[0.5, 0.5]], scatter=math.nan), "scatter: got.*positive"),
+        (lambda fit: dr.detect(fit, inner=1 * u.m), "inner"),
+        (lambda fit: dr.detect(fit, inner=-1.0), "inner: got.*positive"),
+        (lambda fit: dr.detect(fit, threshold=0.0), "threshold: got.*positive"),
+        (lambda fit: dr.detect(fit, scatter=math.nan), "scatter: got.*positive"),
+        (lambda fit: dr.detect(fit, separations=[0.5, -1.0]), "separations: got.*positive"),
+        (lambda fit: dr.contrast_curve(fit, [math.nan]), "separations: got.*positive"),
+        (lambda fit: dr.contrast_curve(fit, [0.5], scatter=0.0), "scatter: got.*positive"),
+        (lambda fit: dr.contrast_curve(fit, [5.0, 6.0]), r"separations: got \[5\.0, 6\.0\].*corn"),
+    ],
+)
 def test_what_cannot_be_searched_or_measured_is_refused(one, call, words):
     with pytest.raises(DiffrenderError, match=words):
-        call(one)
-
-
-@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan])
-@pytest.mark.parametrize("words", CALLS)
-def test_numbers_that_cannot_be_are_refused(one, words, value):
-    with pytest.raises(IncompatibleSetupError, match=f"{words}.*positive"):
-        CALLS[words](one.fits[0], value)
-
-
-def test_a_contrast_curve_outside_the_field_is_refused(one):
-    fit = one.fits[0]
-    with pytest.raises(IncompatibleSetupError, match=r"separations: got \[5\.0, 6\.0\].*corners"):
-        dr.contrast_curve(fit, [5.0, 6.0])
-    # What is partly inside has rows for that part.
-    curve = dr.contrast_curve(fit, [500.0, 5000.0] * u.mas)
-    assert curve["separation"].to_value("arcsec").tolist() == [0.5]
+        call(one.fits[0])
 
 
 @pytest.mark.slow
-def test_all_errors_have_the_factor_of_their_position(empty):
+def test_all_errors_have_the_factor_of_their_position(world):
     """A fit that does not explain its data is searched with the scatter of its S/N."""
-    (fit,) = empty[0].fits
+    (fit,) = world.detected(0).fits
     # Residuals, and unknowns as far from their priors, three times what they should be.
     frames = tuple(replace(each, residual=3 * each.residual) for each in fit.linear.frames)
     mean = fit.linear.vector - 3 * (fit.linear.vector - fit.linear.mean)
@@ -870,11 +650,9 @@ def test_all_errors_have_the_factor_of_their_position(empty):
     np.testing.assert_allclose(limits["small_sample"], limits["contrast"])
     # The functions for a few positions multiply their errors likewise.
     offsets = np.array([[0.3, 0.1], [0.0, -0.8]])
+    known = plain.measure(offsets)
     for table in (found.measure(offsets), dr.measure(mismatch, offsets)):
-        errors = table["contrast"] / table["snr"]
-        known = plain.measure(offsets)
-        np.testing.assert_allclose(
-            errors * known["snr"] / known["contrast"], factor.of(offsets), rtol=1e-6
-        )
+        ratio = table["contrast"] / table["snr"] * known["snr"] / known["contrast"]
+        np.testing.assert_allclose(ratio, factor.of(offsets), rtol=1e-6)
     again = dr.contrast_curve(mismatch, curve["separation"])
     np.testing.assert_allclose(again["contrast"], curve["contrast"], rtol=1e-6)

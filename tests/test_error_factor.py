@@ -1,7 +1,5 @@
 """Errors and thresholds of a search, against simulated maps of S/N."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -23,19 +21,14 @@ SMOOTH = 1.1
 NOTHING = np.zeros((0, 2))
 
 
-def field(size=80):
-    """x, y of the pixels from the star, arcsec."""
-    axis = PIXEL * (np.arange(size) - (size - 1) / 2)
-    return np.stack(np.meshgrid(axis, axis), axis=-1)
+AXIS = PIXEL * (np.arange(80) - 79 / 2)
+GRID = np.stack(np.meshgrid(AXIS, AXIS), axis=-1)
+"""x, y of the pixels from the star, arcsec."""
 
-
-GRID = field()
 DISTANCE = np.hypot(GRID[..., 0], GRID[..., 1])
-STARLIGHT = (
-    100
-    * (0.3 / np.maximum(DISTANCE, 0.25)) ** 1.6
-    * np.exp(0.5 * np.cos(6 * np.arctan2(GRID[..., 1], GRID[..., 0])))
-)
+EVERYWHERE = np.ones(DISTANCE.shape, dtype=bool)
+SPIKES = np.exp(0.5 * np.cos(6 * np.arctan2(GRID[..., 1], GRID[..., 0])))
+STARLIGHT = 100 * (0.3 / np.maximum(DISTANCE, 0.25)) ** 1.6 * SPIKES
 """Star over noise, with spikes."""
 
 
@@ -60,7 +53,6 @@ RINGS = (0.3, 0.5, 1.0, 2.0)
     [
         pytest.param(np.sqrt(0.5 + 5 * STARLIGHT / 50), id="by starlight"),
         pytest.param(1 + 1.5 * np.exp(-((DISTANCE / 0.8) ** 2)), id="by separation"),
-        pytest.param(np.ones((80, 80)), id="uniform"),
     ],
 )
 def test_the_factor_is_the_scatter_of_the_snr(scale):
@@ -96,35 +88,28 @@ def test_sources_do_not_raise_the_factor():
 @pytest.mark.parametrize("separation", [0.4, 0.8])
 def test_a_source_is_judged_without_its_own_light(separation):
     """At S/N 10 it is significant, though near the star it is much of the scatter of its ring."""
-    pixel = np.unravel_index(
-        np.argmin(np.hypot(GRID[..., 0] - separation, GRID[..., 1])), DISTANCE.shape
-    )
+    away = np.hypot(GRID[..., 0] - separation, GRID[..., 1])
+    pixel = np.unravel_index(np.argmin(away), DISTANCE.shape)
     shape = np.exp(-(np.sum((GRID - GRID[pixel]) ** 2, axis=-1)) / (4 * (SMOOTH * PIXEL) ** 2))
-    judge, everywhere = significance(), np.ones((80, 80), dtype=bool)
-    for seed in range(5):
-        quiet = noise(seed)
-        assert judge.next_peak(quiet, NOTHING, 5.0, everywhere) is None
+    judge = significance()
+    wide = replace(judge, inner=separation + 3 * PIXEL)
+    for quiet in map(noise, range(5)):
+        assert judge.next_peak(quiet, NOTHING, 5.0, EVERYWHERE) is None
         snr = quiet + (10 - quiet[pixel]) * shape
-        assert judge.next_peak(snr, NOTHING, 5.0, everywhere) == pixel
+        assert judge.next_peak(snr, NOTHING, 5.0, EVERYWHERE) == pixel
         # Not where it is not allowed, and not where it is known.
-        assert judge.next_peak(snr, GRID[pixel][None], 5.0, everywhere) is None
-        assert judge.next_peak(snr, NOTHING, 5.0, ~everywhere) is None
-        wide = replace(judge, inner=separation + 3 * PIXEL)
-        assert wide.next_peak(snr, NOTHING, 5.0, everywhere) is None
+        assert judge.next_peak(snr, GRID[pixel][None], 5.0, EVERYWHERE) is None
+        assert judge.next_peak(snr, NOTHING, 5.0, ~EVERYWHERE) is None
+        assert wide.next_peak(snr, NOTHING, 5.0, EVERYWHERE) is None
 
 
 def test_noise_passes_as_rarely_as_gaussian_noise_would():
     """At a threshold that noise passes often; `benchmarks/false_alarms.py` has that of 5."""
-    scale, judge, everywhere = (
-        1 + 1.5 * np.exp(-((DISTANCE / 0.8) ** 2)),
-        significance(),
-        (np.ones((80, 80), dtype=bool)),
-    )
-    count, nominal, passed, naive = 40, 0, 0, 0
-    for seed in range(count):
-        unit = noise(seed)
+    scale, judge = 1 + 1.5 * np.exp(-((DISTANCE / 0.8) ** 2)), significance()
+    nominal, passed, naive = 0, 0, 0
+    for unit in map(noise, range(40)):
         nominal += bool((unit[DISTANCE > 0.2] > 3.5).any())
-        passed += judge.next_peak(scale * unit, NOTHING, 3.5, everywhere) is not None
+        passed += judge.next_peak(scale * unit, NOTHING, 3.5, EVERYWHERE) is not None
         naive += bool((scale * unit / np.std(scale * unit) > 3.5)[DISTANCE > 0.2].any())
     # The difference of two counts that agree in most maps is known to 3 or so.
     assert abs(passed - nominal) <= 10
@@ -133,11 +118,9 @@ def test_noise_passes_as_rarely_as_gaussian_noise_would():
 
 def test_probability_of_a_maximum_of_noise():
     judge = significance(measured=False)
-    allowed = DISTANCE >= 0.2
     heights = []
-    for seed in range(300):
-        values = noise(seed)
-        peak = np.unravel_index(np.argmax(np.where(allowed, values, -9)), values.shape)
+    for values in map(noise, range(300)):
+        peak = np.unravel_index(np.argmax(np.where(DISTANCE >= 0.2, values, -9)), values.shape)
         # The curvature at a maximum is known: its height between the pixels follows from the slope.
         height = values[peak]
         for axis in (0, 1):

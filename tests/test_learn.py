@@ -1,26 +1,28 @@
-"""Learning the flat-field pattern from many stars: the library, its test on each, its files."""
+"""Flat-field patterns: learned from many stars, and chosen for a target."""
 
-from __future__ import annotations
-
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from astropy import units as u
+from astropy.io import fits
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender import errors
 from pyklip_diffrender.pattern import MeasuredPattern, choose_systematics, package_library
+from pyklip_diffrender.pyklip_backend import subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.klip_call import check_settings
 from pyklip_diffrender.reduction import ReduceOptions
-from pyklip_diffrender.refinement import GaussNewton
 
 SIZE = 32
 FLAT = "crds://jwst_nircam_flat_9999.fits"
 OPD = dr.random_opd(1, npix=256)
 # The frames differ from the model by flux and pattern only.
-ALIGNED = GaussNewton(free=("flux", "background"), wavefront=False, companions_if_stalled=False)
+ALIGNED = dr.GaussNewton(free=("flux", "background"), wavefront=False, companions_if_stalled=False)
 RMS = 0.05
 PATTERN = RMS * np.random.default_rng(5).normal(size=(SIDE, SIDE))
 PEDESTAL = 1.0
@@ -32,7 +34,6 @@ def starlight(tmp_path_factory):
     (frame,) = dr.Sequence.from_files([written(tmp_path_factory.mktemp("one"), "HD 1")]).science
     cut = frame.cutout(SIZE)
     model = dr.model_for(frame, SIZE)
-    assert cut.first_pixel is not None
     middle = (SIZE - 1) / 2
     shift = tuple((cut.center[0] - middle) * model.detector.pixelscale)
     image = np.zeros((SIDE, SIDE))
@@ -43,10 +44,9 @@ def starlight(tmp_path_factory):
 
 
 def written(folder, star, k=1, light=None):
-    cards = {"SUBSTRT1": 601, "SUBSTRT2": 1601, "R_FLAT": FLAT}
-    name = f"jw01184{k:03d}001_03106_00001_nrcalong_calints.fits"
     return calints(
-        folder / name, star, observation=k, roll=70.0 + 5 * k, cards=cards, light=light,
+        folder / f"jw01184{k:03d}001_03106_00001_nrcalong_calints.fits", star, observation=k,
+        roll=70.0 + 5 * k, cards={"SUBSTRT1": 601, "SUBSTRT2": 1601, "R_FLAT": FLAT}, light=light,
         date=f"2022-10-03T{k:02d}:00:00",
     )  # fmt: skip
 
@@ -82,10 +82,8 @@ def test_the_pattern_of_one_star_holds_for_the_other(frames, tmp_path):
     frame = dr.Observation.from_fits(written(tmp_path, "HD 3", 9)).cutout(SIZE)
     known = dr.known_systematics(frame, library=library)
     assert known.provenance["stars"] == ["HD 1", "HD 2"]
-    assert frame.first_pixel is not None
     x, y = np.array(frame.first_pixel) - (600, 1600)
-    truth = PATTERN[y : y + SIZE, x : x + SIZE]
-    got, error = known.at(frame)
+    truth, (got, error) = PATTERN[y : y + SIZE, x : x + SIZE], known.at(frame)
     sure = error < 0.3 * RMS
     assert sure.mean() > 0.2
     assert np.corrcoef(got[sure], truth[sure])[0, 1] > 0.95
@@ -104,9 +102,11 @@ def test_the_pattern_of_one_star_holds_for_the_other(frames, tmp_path):
 
 
 def test_stars_and_filters_that_are_not_there_are_refused(frames):
-    with pytest.raises(IncompatibleSetupError, match=r"star: got 'HD 7', expected one of 'HD 1'"):
+    with pytest.raises(
+        errors.IncompatibleSetupError, match=r"star: got 'HD 7', expected one of 'HD 1'"
+    ):
         learned(frames, stars=["HD 7"])
-    with pytest.raises(IncompatibleSetupError, match=r"filter: got 'F356W'"):
+    with pytest.raises(errors.IncompatibleSetupError, match=r"filter: got 'F356W'"):
         learned(frames, filters=["F356W"])
 
 
@@ -114,7 +114,7 @@ def test_frames_without_a_place_or_a_unit_are_left_out(tmp_path, caplog):
     calints(tmp_path / "a_calints.fits", "HD 1")
     cards = {"BUNIT": "DN/s", "SUBSTRT1": 601, "SUBSTRT2": 1601}
     calints(tmp_path / "b_rateints.fits", "HD 2", observation=2, cards=cards)
-    with pytest.raises(NoValidPixelsError, match="no star is left"):
+    with pytest.raises(errors.NoValidPixelsError, match="no star is left"):
         learned(tmp_path)
     assert "does not say which pixels of the detector" in caplog.text
     assert "its unit is" in caplog.text
@@ -141,12 +141,11 @@ def observation(**cards):
 
 
 def test_a_library_is_searched_by_setup_place_star_and_flat():
-    usual = [measured("A"), measured("B"), measured("B", 2, flat="old.fits")]
-    others = [
+    library = dr.PatternLibrary((
+        measured("A"), measured("B"), measured("B", 2, flat="old.fits"),
         measured("C", image_mask="MASK430R"), measured("C", filter="F356W"),
         measured("C", detector="NRCA2"), measured("C", first_pixel=(100, 1600)),
-    ]  # fmt: skip
-    library = dr.PatternLibrary((*usual, *others))
+    ))  # fmt: skip
 
     def stars(**cards):
         return [f"{each.star} {each.flat}" for each in library.matching(observation(**cards))]
@@ -156,12 +155,8 @@ def test_a_library_is_searched_by_setup_place_star_and_flat():
     # A flat field that none has: the one of most patterns, which the fit may refute.
     assert stars(R_FLAT="crds://newest.fits") == stars() == ["A new.fits", "B new.fits"]
     assert stars(R_FLAT="new.fits", TARGNAME="a") == ["B new.fits"]
-
-
-def test_a_star_is_known_by_its_coordinates_too():
-    """Another programme may call it by another name."""
-    header = {"TARGPROP": "Target 7", "TARG_RA": 53.1, "TARG_DEC": -9.4}
-    frame = observation(**header)
+    # A star is known by its coordinates too: another programme may call it by another name.
+    frame = observation(TARGPROP="Target 7", TARG_RA=53.1, TARG_DEC=-9.4)
     catalogue = replace(measured("A").catalogue, names=("G 80-21",), coordinates=(53.1001, -9.4))
     library = dr.PatternLibrary((measured("G 80-21", catalogue=catalogue), measured("B")))
     assert [each.star for each in library.matching(frame)] == ["B"]
@@ -171,17 +166,14 @@ def test_pedestals_are_brought_together():
     one = measured("A")
     other = one.with_pedestal(3.0)
     np.testing.assert_allclose(other.value * (one.light + 3.0), one.value * (one.light + 1.0))
-    assert one.light is not None
     frame = observation()
-    library = dr.PatternLibrary((other, measured("B"), measured("C")))
-    known = dr.known_systematics(frame, library=library)
-    assert known.pedestal == 1.0
     # Without their stars the patterns of a file keep the pedestal that they have.
     bare = replace(measured("B", pedestal=0.7), light=None)
-    known = dr.known_systematics(frame, library=dr.PatternLibrary((other, bare, measured("C"))))
-    assert known.pedestal == 0.7
+    for second, expected in ((measured("B"), 1.0), (bare, 0.7)):
+        library = dr.PatternLibrary((other, second, measured("C")))
+        assert dr.known_systematics(frame, library=library).pedestal == expected
     both = dr.PatternLibrary((bare, replace(measured("C"), light=None)))
-    with pytest.raises(IncompatibleSetupError, match="without its star"):
+    with pytest.raises(errors.IncompatibleSetupError, match="without its star"):
         dr.known_systematics(frame, library=both)
 
 
@@ -208,10 +200,10 @@ def test_libraries_survive_their_files_and_are_combined(tmp_path):
     (tmp_path / "one.fits.gz").unlink()
     measured_file = dr.Systematics(np.zeros((8, 8)), np.ones((8, 8)), (15.5, 15.5), 0.1)
     measured_file.write(tmp_path / "systematics.fits")
-    with pytest.raises(CorruptFileError, match=r"systematics.fits: got no version"):
+    with pytest.raises(errors.CorruptFileError, match=r"systematics.fits: got no version"):
         dr.PatternLibrary.read(tmp_path)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CorruptFileError, match="no FITS files"):
+    with pytest.raises(errors.CorruptFileError, match="no FITS files"):
         dr.PatternLibrary.read(tmp_path / "empty")
 
 
@@ -228,7 +220,7 @@ def test_a_folder_of_libraries_is_a_choice_of_systematics(tmp_path):
     chosen = choose_systematics([other], [], model, OPD, systematics=options.systematics)
     assert chosen.label == "library (HIP17695, G-7-34)"
     check_settings(dr.DiffrenderSettings(systematics=tmp_path / "own"))
-    with pytest.raises(IncompatibleSetupError, match=r"systematics: got .*nowhere"):
+    with pytest.raises(errors.IncompatibleSetupError, match=r"systematics: got .*nowhere"):
         check_settings(dr.DiffrenderSettings(systematics=tmp_path / "nowhere"))
 
 
@@ -240,13 +232,9 @@ def test_real_stars_teach_the_pattern_of_another(shared_data):
         "accurate_steps": False, "companions_if_stalled": False,
     }  # fmt: skip
     library = dr.learn_library(
-        shared_data / "gto1184",
-        shared_data / "opd_2022-08-14.fits.gz",
-        stars=["HIP 17695", "G 7-34"],
-        filters=["F444W"],
-        size=32,
-        settings=dr.GaussNewton.nircam("F444W", **settings),
-    )
+        shared_data / "gto1184", shared_data / "opd_2022-08-14.fits.gz", filters=["F444W"], size=32,
+        stars=["HIP 17695", "G 7-34"], settings=dr.GaussNewton.nircam("F444W", **settings),
+    )  # fmt: skip
     rows = library.validation
     assert list(rows["star"]) == ["HIP17695", "G-7-34"]
     assert (rows["chi2_with_others"] < 0.5 * rows["chi2_alone"]).all()
@@ -258,3 +246,175 @@ def test_real_stars_teach_the_pattern_of_another(shared_data):
         there = (slice(y, y + 32), slice(x, x + 32))
         both = np.isfinite(pattern.variance) & np.isfinite(other.variance[there])
         assert np.corrcoef(pattern.value[both], other.value[there][both])[0, 1] > 0.7
+
+
+# -- which pattern a target is fitted with: of the library, of other stars, or none ---------------
+
+COARSE = dr.random_opd(1, npix=64)
+LIBRARY = {"INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R"}
+SAME_FLAT = {**LIBRARY, "R_FLAT": "crds://jwst_nircam_flat_0465.fits"}
+OTHER_FLAT = {**LIBRARY, "R_FLAT": "crds://jwst_nircam_flat_0999.fits"}
+ELSEWHERE = {**LIBRARY, "DETECTOR": "NRCA2"}
+PLACE = (625, 1659)
+"""Pixels in the middle of those that the library has."""
+STARS = "HIP17695, G-7-34"
+
+
+@cache
+def model():
+    return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=SIZE)
+
+
+def frame(target, cards, *, shown=1.0, seed=1):
+    """A bright star, with a part of the library's pattern, on known pixels."""
+    light = 3e6 * model()(COARSE.data).numpy()
+    blank = dr.Observation.from_arrays(
+        light, np.ones_like(light), pixelscale=model().detector.pixelscale, filter="F444W",
+        unit=u.MJy / u.sr, name=f"{target} {seed}", first_pixel=PLACE,
+        header=fits.Header({"TARGPROP": target, **LIBRARY}), position_angles=np.array([5.0 * seed]),
+    )  # fmt: skip
+    known = dr.known_systematics(blank)
+    noise = 0.01 * np.sqrt(light + 1.0)
+    data = light + shown * known.at(blank)[0] * (light + known.pedestal)
+    data += noise * np.random.default_rng(seed).standard_normal(light.shape)
+    header = fits.Header({"TARGPROP": target, **cards})
+    return replace(blank, data=data[None], error=noise[None], header=header)
+
+
+def rolls(cards, **changes):
+    return [frame("TARGET", cards, seed=k, **changes) for k in (1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("request_", "cards", "fitted", "label", "used"),
+    [
+        ("auto", LIBRARY, False, f"library ({STARS})", 0),
+        ("auto", ELSEWHERE, True, "references (REF)", 2),
+        ("references", LIBRARY, True, f"references (REF), library ({STARS})", 2),
+        ("off", LIBRARY, False, "none", 0),
+        ("mine", LIBRARY, False, "given (mine)", 0),
+    ],
+)
+def test_references_are_fitted_only_where_they_are_needed(request_, cards, fitted, label, used):
+    zeros = np.zeros((SIZE, SIZE))
+    mine = dr.Systematics(zeros, zeros, (15.5, 15.5), 0.1, name="mine")
+    read = []
+
+    def references():
+        read.extend(frame("REF", cards, seed=k) for k in (3, 4))
+        return read
+
+    chosen = choose_systematics(
+        # Two rolls, which would share a pattern of their own if nothing else were known.
+        rolls(cards), references, model(), COARSE, settings=ALIGNED,
+        systematics=mine if request_ == "mine" else request_,
+    )  # fmt: skip
+    assert bool(read) == bool(chosen.references) == fitted
+    assert (chosen.label, chosen.reference_frames) == (label, used)
+    assert (chosen.systematics is None) == (label == "none")
+    assert chosen.settings is ALIGNED
+
+
+def test_a_known_pattern_takes_the_place_of_most_of_the_models_error():
+    (roll,) = (frame("TARGET", LIBRARY),)
+    preset = dr.GaussNewton.nircam("F444W", min_model_error=0.002)
+    assert choose_systematics([roll], (), model(), COARSE).settings == preset
+    limited = choose_systematics([roll], (), model(), COARSE, memory=2e9).settings
+    assert limited == replace(preset, memory=2e9)
+    assert choose_systematics([roll], (), model(), COARSE, systematics="off").settings is None
+
+
+@pytest.mark.parametrize(
+    ("cards", "shown", "references", "labels"),
+    [
+        (SAME_FLAT, 1.0, 2, [f"library ({STARS})"]),
+        (SAME_FLAT, 0.0, 2, [f"library ({STARS})", "references (REF)"]),
+        (SAME_FLAT, 0.0, 0, [f"library ({STARS})", "the rolls themselves"]),
+        # The first frame tells as much where the header names another flat field, or none.
+        (LIBRARY, 0.0, 2, ["references (REF)"]),
+        (OTHER_FLAT, 0.0, 0, ["the rolls themselves"]),
+        (OTHER_FLAT, 1.0, 2, [f"library ({STARS})"]),
+    ],
+)
+def test_a_library_of_another_flat_field_is_replaced(cards, shown, references, labels):
+    """The fit is repeated with what there is besides the library."""
+    fitted = []
+
+    def fit(choice, again):
+        assert again == bool(fitted)
+        fitted.append(choice.label)
+        systematics = choice.systematics
+        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, systematics=systematics)
+
+    others = [frame("REF", cards, shown=shown, seed=3 + k) for k in range(references)]
+    given = rolls(cards, shown=shown), others, model(), COARSE
+    choice, last = dr.pattern.fit_with_pattern(*given, fit, settings=ALIGNED)
+    assert fitted == labels
+    assert last.systematics is choice.systematics
+
+
+def test_rolls_share_an_unknown_pattern_where_nothing_is_known():
+    def chosen(*rolls, systematics="auto"):
+        return choose_systematics(rolls, [], model(), COARSE, systematics=systematics).systematics
+
+    roll, turned = rolls(ELSEWHERE)
+    pattern = chosen(roll, turned)
+    assert pattern.name == "the rolls themselves"
+    values, errors = pattern.at(roll)
+    assert (values == 0).all()
+    assert (errors == 0.03).all()
+    assert pattern.pedestal == 1.9
+    assert chosen(roll, replace(turned, unit=u.DN / u.s)) is not None
+    # One roll, in one file or two, different pixels, pixels that are not known, other instruments,
+    # and "off".
+    elsewhere = replace(turned, first_pixel=(601, 1600))
+    lost = [replace(each, first_pixel=None) for each in (roll, turned)]
+    simulated = [replace(each, header=fits.Header()) for each in (roll, turned)]
+    for frames in ([roll], [roll, roll], [roll, elsewhere], lost, simulated):
+        assert chosen(*frames) is None
+    assert chosen(roll, turned, systematics="off") is None
+
+
+@pytest.mark.parametrize("shown", [1.0, 0.0])
+def test_a_rough_fit_tells_which_pixels_a_frame_shows(shown, caplog):
+    """Where it shows the pattern; otherwise the pattern is not used."""
+    lost = replace(frame("TARGET", LIBRARY, shown=shown), first_pixel=None)
+    choice = choose_systematics([lost], [], model(), COARSE, settings=ALIGNED)
+    assert (choice.label == f"library ({STARS})") == (shown > 0)
+    assert choice.science[0].first_pixel == (PLACE if shown else None)
+    assert ("is not seen in them; it is not used" in caplog.text) == (shown == 0)
+    assert choice.settings is ALIGNED
+
+
+@pytest.mark.parametrize(
+    ("cards", "shown", "label"),
+    [
+        ({}, 1.0, "none"),
+        pytest.param(LIBRARY, 1.0, STARS, marks=pytest.mark.slow),
+        (SAME_FLAT, 0.0, "none"),
+    ],
+)
+def test_pyklip_chooses_as_a_reduction_does(cards, shown, label):
+    """Simulations use no pattern by default."""
+    settings = dr.DiffrenderSettings(
+        model=model(), fit=ALIGNED, max_chi2=np.inf, keep_detected=False
+    )
+    told = []
+    # On simulations the pattern is an error of the model.
+    warned = nullcontext() if cards else pytest.warns(errors.DiffrenderWarning)
+    with warned:
+        star = frame("TARGET", cards, shown=shown)
+        result = subtract_by_refinement(star, COARSE, settings, tell=told.append)
+    assert result.systematics == label
+    refuted = any("without the library's flat-field pattern" in each for each in told)
+    assert refuted == (bool(cards) and shown == 0)
+
+
+@pytest.mark.slow
+def test_a_reduction_keeps_the_references_that_it_fitted():
+    references = tuple(frame("REF", LIBRARY, seed=k) for k in (3, 4))
+    sequence = dr.Sequence("TARGET", tuple(rolls(LIBRARY)), references)
+    result = dr.reduce(sequence, COARSE, size=24, settings=ALIGNED, systematics="references")
+    assert [len(each.frames) for each in result.references] == [2]
+    assert result.systematics is result.fit.systematics
+    assert "REF" in result.systematics.provenance["stars"]

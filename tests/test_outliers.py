@@ -1,7 +1,5 @@
 """Bad pixels that the file does not flag, told from planets by their neighbours."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -24,9 +22,8 @@ SETTINGS = dr.GaussNewton(
 @cache
 def model(name="F444W"):
     wavelength = {"F444W": 4.5e-6, "F250M": 2.5e-6}[name]
-    return dr.nircam_coronagraph(
-        name, monochromatic=wavelength, npix=NPIX, fov_pixels=SIZE, fov_arcsec=None
-    )
+    size = {"npix": NPIX, "fov_pixels": SIZE, "fov_arcsec": None}
+    return dr.nircam_coronagraph(name, monochromatic=wavelength, **size)
 
 
 @cache
@@ -45,13 +42,11 @@ def spoiled(frame, sigmas):
 
 
 def fitted(*frames, name="F444W", **changes):
-    settings = replace(SETTINGS, **changes)
-    return dr.refine(model(name), list(frames), start(), settings=settings)
+    return dr.refine(model(name), list(frames), start(), settings=replace(SETTINGS, **changes))
 
 
 def left_out(fit, k=0):
-    rows, columns = np.nonzero(~fit.frames[k].observation.valid[0])
-    return list(zip(rows.tolist(), columns.tolist(), strict=True))
+    return [tuple(each) for each in np.argwhere(~fit.frames[k].observation.valid[0]).tolist()]
 
 
 def here(*, row=PIXEL[0], column=PIXEL[1], contrast):
@@ -69,6 +64,10 @@ def test_a_hot_pixel_is_no_planet():
     assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.15)
     np.testing.assert_array_equal(frame.data, before[0])
     np.testing.assert_array_equal(frame.valid, before[1])
+    # Fits that go on do not get it back.
+    again = refine_again(fit)
+    assert left_out(again) == [PIXEL]
+    assert again.chi2_per_pixel == pytest.approx(fit.chi2_per_pixel, rel=0.01)
 
 
 def test_the_star_is_fitted_without_a_dead_pixel():
@@ -83,22 +82,19 @@ def test_the_star_is_fitted_without_a_dead_pixel():
 
 
 def test_a_pixel_that_the_fit_took_for_a_companion():
-    planet = here(contrast=3e-6)
-    fit = fitted(spoiled(shot(), 40.0), companions=(planet,))
-    assert left_out(fit) == [PIXEL]
+    assert left_out(fitted(spoiled(shot(), 40.0), companions=(here(contrast=3e-6),))) == [PIXEL]
 
 
 def test_a_bright_companion_of_the_fit_keeps_its_core():
     """Its model is wrong by more than the noise, and its own unknowns explain any source there."""
     planet = here(contrast=1e-4)
-    frame = spoiled(shot(planet), 15.0)
-    fit = fitted(frame, companions=(planet,))
+    fit = fitted(spoiled(shot(planet), 15.0), companions=(planet,))
     assert left_out(fit) == []
     assert fit.companions[0, 0] == pytest.approx(1e-4, rel=0.1)
 
 
 def test_a_hot_pixel_on_a_planet_is_left_out():
-    """It would make the planet brighter and move it."""
+    """It would make the planet brighter and move it. Only the frame that shows it loses it."""
     planet = here(row=PIXEL[0] + 0.3, column=PIXEL[1] - 0.2, contrast=4e-6)
     frames = [shot(planet), spoiled(shot(planet, seed=SCENE + 1), 25.0)]
     fit = fitted(*frames, companions=(planet,))
@@ -109,12 +105,10 @@ def test_a_hot_pixel_on_a_planet_is_left_out():
 @pytest.mark.parametrize(
     ("name", "shift", "contrast"),
     [
-        ("F444W", (0.0, 0.0), 2e-6),
+        ("F444W", (0.5, 0.3), 2e-6),
         # An image that is hardly wider than a pixel.
         ("F250M", (0.0, 0.0), 2e-6),
         # Fits that do not have the planet take many steps.
-        pytest.param("F444W", (0.5, 0.3), 1e-4, marks=pytest.mark.slow),
-        pytest.param("F250M", (0.0, 0.0), 1e-4, marks=pytest.mark.slow),
         pytest.param("F250M", (0.25, 0.25), 1e-4, marks=pytest.mark.slow),
     ],
 )
@@ -123,16 +117,3 @@ def test_planets_are_kept(name, shift, contrast):
     frame, without = shot(planet, name=name), shot(name=name)
     assert ((frame.data - without.data) / frame.error).max() > 8
     assert left_out(fitted(frame, name=name)) == []
-
-
-def test_only_the_frame_that_shows_it_loses_the_pixel():
-    frames = [spoiled(shot(), 30.0), shot(seed=SCENE + 1)]
-    fit = fitted(*frames)
-    assert (left_out(fit, 0), left_out(fit, 1)) == ([PIXEL], [])
-
-
-def test_fits_that_go_on_do_not_get_it_back():
-    fit = fitted(spoiled(shot(), 25.0))
-    again = refine_again(fit)
-    assert left_out(again) == [PIXEL]
-    assert again.chi2_per_pixel == pytest.approx(fit.chi2_per_pixel, rel=0.01)

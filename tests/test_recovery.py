@@ -1,10 +1,8 @@
 """Planets that are injected into fitted frames, and what is measured of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from functools import cache
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from astropy.table import QTable
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Candidates, measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.recovery import _free_place
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 NORTH = 20.0
@@ -27,7 +24,7 @@ LIMIT = 1e-4
 class Frame:
     """In place of a `FrameFit`: a planet is a pixel; every next frame is brighter by 1."""
 
-    values: ClassVar[dict[str, Any]] = {}
+    values = MappingProxyType({})
 
     def __init__(self, flux):
         blank = np.zeros((SIZE, SIZE))
@@ -50,91 +47,81 @@ def searched(science=None, **changes):
 
     def measure(places):
         assert (science[1].data == 2 * science[0].data).all()
-        values = [
-            science[0].data[0][
-                tuple(np.round(np.array(place) / PIXEL + SIZE // 2).astype(int)[::-1])
-            ]
-            for place in places
-        ]
-        return table(np.zeros((len(places), 2)), values)
+        columns, rows = np.round(np.array(places).T / PIXEL + SIZE // 2).astype(int)
+        return table(np.zeros((len(places), 2)), science[0].data[0][rows, columns])
 
     curve = QTable({"separation": [0.2, 1.0] * u.arcsec, "small_sample": [2 * LIMIT, LIMIT]})
-    changes.setdefault("candidates", table(np.zeros((0, 2)), []))
+    found = changes.setdefault("candidates", table(np.zeros((0, 2)), []))
+    # Errors of contrasts are 1.5 times those for a known position.
+    errors = torch.full((len(found),), 0.1 * LIMIT, dtype=torch.float64)
+    sources = replace(
+        Candidates.at(np.stack([found["x"].value, found["y"].value], axis=-1), found["contrast"]),
+        covariance=torch.diag((1.5 * errors).repeat(3) ** 2),
+        detection_errors=errors,
+    )
     values = {
         "has_limits": np.isfinite(changes.get("snr", snr)),
-        "fits": [SimpleNamespace(frames=[Frame(1.0), Frame(2.0)])],
+        "fits": [SimpleNamespace(frames=[Frame(1.0), Frame(2.0)])], "sources": sources,
         "grid": grid, "snr": snr, "north": NORTH, "contrast_curve": curve, "measure": measure,
-        "sources": sources(changes["candidates"]), "error_factor": ErrorFactor.constant(1.0),
+        "error_factor": ErrorFactor.constant(1.0),
     }  # fmt: skip
     return SimpleNamespace(**{**values, **changes})
 
 
-def sources(candidates):
-    """Errors of contrasts are 1.5 times those for a known position."""
-    places = np.stack([candidates["x"].value, candidates["y"].value], axis=-1)
-    errors = torch.full((len(candidates),), 0.1 * LIMIT, dtype=torch.float64)
-    return replace(
-        Candidates.at(places, candidates["contrast"]),
-        covariance=torch.diag((1.5 * errors).repeat(3) ** 2),
-        detection_errors=errors,
-    )
-
-
 def table(places, contrasts):
     contrasts = np.asarray(contrasts, dtype=float)
-    return QTable(
-        {
-            "x": places[:, 0] * u.arcsec, "y": places[:, 1] * u.arcsec, "contrast": contrasts,
-            "contrast_error": 0.1 * LIMIT * np.ones(len(contrasts)),
-            "snr": 10 * contrasts / LIMIT,
-        }
-    )  # fmt: skip
+    return QTable({
+        "x": places[:, 0] * u.arcsec, "y": places[:, 1] * u.arcsec, "contrast": contrasts,
+        "contrast_error": 0.1 * LIMIT * np.ones(len(contrasts)), "snr": 10 * contrasts / LIMIT,
+    })  # fmt: skip
 
 
-@pytest.mark.parametrize("count", [1, 5])
-def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(count):
+@pytest.mark.parametrize("flux", [1.0, 2.0])
+def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(flux):
+    """Relative to the star of the injection, even if it is brighter in the fit with planets."""
     sets = []
 
     def search(science):
         sets.append(science)
-        return searched(science)
+        return searched(science, fits=[SimpleNamespace(frames=[Frame(flux), Frame(2 * flux)])])
 
-    planets = recover_planets(searched(), count, search)
-    assert len(planets) == count
+    planets = recover_planets(searched(), 5, search)
+    assert len(planets) == 5
     limit = 2 ** ((1.0 - planets["separation"].value) / 0.8) * LIMIT
     assert np.asarray(planets["injected"]) == pytest.approx(1.6 * limit)
     # What was measured at the place is what was injected there.
-    assert np.asarray(planets["contrast"]) == pytest.approx(np.asarray(planets["injected"]))
+    np.testing.assert_allclose(planets["contrast"], flux * planets["injected"])
     assert not planets["detected"].any()
     # Two in a field of 0.8 arcsec.
-    assert [np.count_nonzero(each[0].data) for each in sets] == [2] * (count // 2) + [1]
-    seen = {
-        tuple(np.round((np.array(pixel[::-1]) - SIZE // 2) * PIXEL, 6))
-        for each in sets
-        for pixel in np.argwhere(each[0].data[0]).tolist()
-    }
+    assert [np.count_nonzero(each[0].data) for each in sets] == [2, 2, 1]
+    pixels = np.concatenate([np.argwhere(each[0].data[0]) for each in sets])
     for row in planets:
         angle = float(row["position_angle"].value) - NORTH
         place = dr.Planet(1.0, float(row["separation"].value), angle).offset
-        assert min(np.hypot(x - place[0], y - place[1]) for x, y in seen) < 0.75 * PIXEL
-    assert len(set(np.round(planets["separation"].value, 3))) == count
+        away = (pixels[:, ::-1] - SIZE // 2) * PIXEL - place
+        assert np.hypot(*away.T).min() < 0.75 * PIXEL
+    assert len(set(np.round(planets["separation"].value, 3))) == 5
     assert "..." not in str(planets)
 
 
-def test_no_planet_is_where_extended_light_would_hide_it():
-    """All but a quarter of the field is hidden."""
-    grid = searched().grid
-    hidden = (grid[..., 0] < 0) | (grid[..., 1] < 0)
-    images = []
+@pytest.mark.parametrize("anywhere", [True, False])
+def test_planets_keep_away_from_candidates_and_from_pixels_without_a_limit(anywhere):
+    """Without any other place they are not left out."""
+    x, y = np.moveaxis(searched().grid, -1, 0)
+    candidate, images = table(np.array([[0.5, 0.5]]), [1e-3]), []
 
     def search(science):
-        images.append(science[0].data[0])
+        images.append(science[0].data[0] > 0)
         return searched(science)
 
-    planets = recover_planets(searched(has_limits=~hidden), 5, search)
-    assert len(planets) == 5
-    assert sum(np.count_nonzero(each) for each in images) == 5
-    assert not any(each[hidden].any() for each in images)
+    has_limits = (y >= 0) & anywhere
+    detection = searched(has_limits=has_limits, candidates=candidate)
+    assert len(recover_planets(detection, 5, search)) == 5
+    assert sum(each.sum() for each in images) == 5
+    if anywhere:
+        used = np.any(images, axis=0)
+        assert has_limits[used].all()
+        assert np.hypot(x - 0.5, y - 0.5)[used].min() > 0.3
 
 
 @pytest.mark.parametrize(
@@ -157,36 +144,6 @@ def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(away, expect
     assert measured.snr == pytest.approx(10 * contrast / LIMIT)
 
 
-def test_recovered_contrasts_are_relative_to_the_star_of_the_injection():
-    """Though the star is twice as bright in the fit of the frames with planets."""
-
-    def search(science):
-        brighter = SimpleNamespace(frames=[Frame(2.0), Frame(4.0)])
-        return searched(science, fits=[brighter])
-
-    planets = recover_planets(searched(), 2, search)
-    np.testing.assert_allclose(planets["contrast"], 2 * planets["injected"])
-
-
-def covered(keep):
-    plain = searched()
-    x, y = np.moveaxis(plain.grid, -1, 0)
-    return searched(snr=np.where(keep(x, y), plain.snr, np.nan))
-
-
-def test_planets_keep_away_from_candidates_and_from_pixels_without_a_value():
-    first = _free_place(searched(), 0.6, 0.0)
-    assert first == pytest.approx([0.0, 0.6])
-    candidate = searched(candidates=table(first[None], [1e-3]))
-    moved = _free_place(candidate, 0.6, 0.0)
-    assert np.hypot(*moved) == pytest.approx(0.6)
-    assert 0.3 < np.hypot(*(moved - first)) < 0.5
-    below = _free_place(covered(lambda x, y: y < 0), 0.6, 0.0)
-    assert below[1] < 0
-    # Without any such place, planets are not left out.
-    assert _free_place(covered(lambda x, y: x > 9), 0.6, 0.0) == pytest.approx(first)
-
-
 def test_injected_planets_turn_with_the_sky():
     """East of north is 30 degrees less from +y in a frame whose +y is 30 degrees further east."""
     frames = [Frame(3.0), Frame(3.0)]
@@ -204,3 +161,53 @@ def test_injected_planets_turn_with_the_sky():
 def test_a_wrong_number_of_planets_is_refused_before_anything_is_read(count):
     with pytest.raises(IncompatibleSetupError, match="injections"):
         dr.reduce("no such folder", "no such map", injections=count)
+
+
+# -- completeness: the fraction of planets that a search finds ----------------------------------
+
+
+@cache
+def star_alone():
+    """A star alone, of which the model is exact."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    opd = dr.random_opd(1, npix=128)
+    frame = dr.simulate(model, dr.Scene(), opd, seed=3)
+    return dr.detect(dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6)))
+
+
+def test_half_of_the_planets_at_the_limit_are_found():
+    """Noise is Gaussian: S/N of planets at the limit is 5 on average, and symmetric about it."""
+    table = dr.completeness(
+        star_alone(), separations=[0.5] * u.arcsec, strengths=[0.5, 1.0, 2.0], angles=20
+    )
+    assert list(table["planets"]) == [20] * 3
+    faint, half, bright = table["completeness"]
+    # S/N 2.5 and 10 on average; it varies with the angle, and between pixel centres.
+    assert faint <= 0.05
+    assert bright == 1
+    # The standard deviation of the fraction of 20 planets is 0.11.
+    assert 0.2 < half < 0.8
+    curve = star_alone().contrast_curve
+    limit = np.interp(0.5, curve["separation"].value, curve["small_sample"])
+    assert table["contrast"][1] == pytest.approx(limit, rel=0.02)
+    assert 0.7 < table.meta["contrast_50"][0] / limit < 1.3
+    assert 0 < table.meta["false_alarm"] < 1e-3
+
+
+def test_the_contrast_of_a_fraction_is_interpolated():
+    table = QTable({
+        "separation": np.repeat([0.4, 0.8], 3) * u.arcsec, "contrast": [1e-5, 2e-5, 4e-5] * 2,
+        "completeness": [0.0, 0.4, 0.8, 0.6, 0.5, 0.7],
+    })  # fmt: skip
+    half = dr.detection.contrast_of_completeness(table, 0.5)
+    assert list(half["separation"].value) == [0.4, 0.8]
+    # A quarter of the way from 0.4 to 0.8, in the logarithm; and more than half from the first on.
+    assert half["contrast"][0] == pytest.approx(2e-5 * 2**0.25)
+    assert np.isnan(half["contrast"][1])
+    assert np.isnan(dr.detection.contrast_of_completeness(table, 0.95)["contrast"]).all()
+
+
+def test_without_fits_there_is_no_completeness(tmp_path):
+    path = next(each for each in star_alone().write(tmp_path) if each.suffix == ".fits")
+    with pytest.raises(IncompatibleSetupError, match="without its fits"):
+        dr.completeness(dr.Detection.read(path))

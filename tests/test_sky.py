@@ -1,20 +1,17 @@
 """What an astronomer reports: positions on the sky, fluxes, limits and epochs, and their errors."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 from astropy import units as u
-from astropy.coordinates import SkyCoord, get_sun
 from astropy.io import ascii, fits
 from astropy.table import QTable
 from astropy.time import Time
 from astropy.wcs import WCS
+from small_files import calints
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Candidates
@@ -24,7 +21,7 @@ from pyklip_diffrender.detection.field import Positions, Sky
 from pyklip_diffrender.detection.measurement import candidate_table, measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import detector_place
-from pyklip_diffrender.refinement import FrameFit, jansky_per_unit, require_calibrated, to_jansky
+from pyklip_diffrender.refinement import jansky_per_unit, require_calibrated, to_jansky
 from pyklip_diffrender.scene import Observation, world_coordinates
 
 # Of jw01184005001_03106_00001_nrcalong_calints.fits. The linear part of its WCS is the pipeline's,
@@ -48,35 +45,28 @@ SKY = Sky(north=NORTH, mjd=59855.5, star=(0.4, 0.04))
 def observation(folder, **changes):
     # Not the same value everywhere, which would be an integration without data.
     image = np.random.default_rng(3).normal(1.0, 0.01, (1, 16, 20))
-    science = fits.ImageHDU(image.astype("f4"), name="SCI")
-    for key, value in {**REAL, **changes}.items():
-        if value is not None:
-            science.header[key] = value
-    error = fits.ImageHDU(np.ones((1, 16, 20), "f4"), name="ERR")
-    quality = fits.ImageHDU(np.zeros((1, 16, 20), "i4"), name="DQ")
-    fits.HDUList([fits.PrimaryHDU(), science, error, quality]).writeto(folder / "calints.fits")
-    return Observation.from_fits(folder / "calints.fits")
+    cards = {**REAL, **changes}
+    path = calints(folder / "calints.fits", image, primary={"DATE-BEG": None}, **cards)
+    return Observation.from_fits(path)
 
 
 def candidates(offsets, contrasts):
-    count = len(contrasts)
-    covariance = np.zeros((3, count, 3, count))
+    covariance = np.zeros((3, len(contrasts), 3, len(contrasts)))
     for k, contrast in enumerate(contrasts):
         covariance[0, k, 0, k] = (0.1 * contrast) ** 2
         covariance[1:, k, 1:, k] = COVARIANCE
     start = Candidates.at(offsets, contrasts)
-    flat = torch.from_numpy(covariance.reshape(3 * count, 3 * count))
+    flat = torch.from_numpy(covariance.reshape(start.covariance.shape))
     return Candidates(start.offsets, start.contrasts, flat, 0.08 * start.contrasts)
 
 
 def table(sky=SKY):
     known = candidates([[-0.3, 0.5], [0.2, -0.8]], [1e-4, 2e-4])
-    return candidate_table(
-        known, ErrorFactor.constant(1.0), np.array([[0.1, 0.1], [0.02, 0.02]]), sky
-    )
+    calibration = np.array([[0.1, 0.1], [0.02, 0.02]])
+    return candidate_table(known, ErrorFactor.constant(1.0), calibration, sky)
 
 
-@pytest.mark.parametrize("pixels", [(10, 0), (0, 10), (-9, 13), (7, -12), (-20, -4)])
+@pytest.mark.parametrize("pixels", [(-9, 13), (7, -12), (-20, -4)])
 def test_the_sky_is_where_the_frames_own_wcs_has_it(tmp_path, pixels):
     """A flipped axis or a wrong sign is wrong by the whole offset; the scales agree to 0.2 %."""
     got = observation(tmp_path)
@@ -86,13 +76,11 @@ def test_the_sky_is_where_the_frames_own_wcs_has_it(tmp_path, pixels):
     y = pixels[1] * mask.siaf_pixelscale[1] + mask.siaf_shear * x
     place_on_sky = Positions(np.array([[x, y]]), COVARIANCE[None], got.position_angle)
     wcs = WCS(fits.Header({k: v for k, v in REAL.items() if k[:2] in ("CT", "CU", "CR", "CD")}))
-    star = wcs.pixel_to_world(*got.center[0])
-    place = wcs.pixel_to_world(*(got.center[0] + pixels))
+    star, place = (wcs.pixel_to_world(*(got.center[0] + k)) for k in ((0, 0), pixels))
     east, north = star.spherical_offsets_to(place)
     distance = star.separation(place).arcsec
-    np.testing.assert_allclose(
-        place_on_sky.on_sky[0], [east.arcsec, north.arcsec], rtol=0, atol=4e-3 * distance
-    )
+    expected = [east.arcsec, north.arcsec]
+    np.testing.assert_allclose(place_on_sky.on_sky[0], expected, rtol=0, atol=4e-3 * distance)
     assert place_on_sky.separation[0] == pytest.approx(distance, rel=3e-3)
     grid = np.stack(np.meshgrid(np.arange(3) * mask.siaf_pixelscale[0], np.arange(3.0)), -1)
     grid[..., 1] *= mask.siaf_pixelscale[1]
@@ -117,18 +105,14 @@ def test_a_planet_in_an_image_is_on_the_side_of_the_sky_where_the_wcs_has_it():
     sine, cosine = np.sin(np.deg2rad(50.0)), np.cos(np.deg2rad(50.0))
     wcs.wcs.cd = np.array([[-cosine, sine], [sine, cosine]]) * model.detector.pixelscale[0] / 3600
     star, place = wcs.pixel_to_world(16, 16), wcs.pixel_to_world(column, row)
-    known = candidate_table(
-        candidates([list(planet.offset)], [1.0]),
-        ErrorFactor.constant(1.0),
-        np.zeros((2, 1)),
-        Sky(north=50.0),
-    )
-    assert known["position_angle"][0].to_value("deg") == pytest.approx(85.0)
-    assert known["frame_angle"][0].to_value("deg") == pytest.approx(35.0)
+    there = candidates([list(planet.offset)], [1.0])
+    known = candidate_table(there, ErrorFactor.constant(1.0), np.zeros((2, 1)), Sky(north=50.0))
+    row, (east, north) = known[0], star.spherical_offsets_to(place)
+    assert row["position_angle"].to_value("deg") == pytest.approx(85.0)
+    assert row["frame_angle"].to_value("deg") == pytest.approx(35.0)
     assert star.position_angle(place).deg == pytest.approx(85.0, abs=4)
-    east, north = star.spherical_offsets_to(place)
-    assert known["delta_ra"][0].to_value("arcsec") == pytest.approx(east.arcsec, abs=0.05)
-    assert known["delta_dec"][0].to_value("arcsec") == pytest.approx(north.arcsec, abs=0.05)
+    assert row["delta_ra"].to_value("arcsec") == pytest.approx(east.arcsec, abs=0.05)
+    assert row["delta_dec"].to_value("arcsec") == pytest.approx(north.arcsec, abs=0.05)
 
 
 def test_without_a_roll_angle_nothing_is_said_about_the_sky(tmp_path):
@@ -145,13 +129,12 @@ def test_the_covariance_turns_with_the_frame(rng):
     place = np.array([row["x"].value, row["y"].value])
     drawn = rng.multivariate_normal(place, COVARIANCE, size=40_000)
     sky = (drawn[:, 1] - 1j * drawn[:, 0]) * np.exp(1j * np.deg2rad(NORTH))
-    sky_names = ("delta_ra", "delta_dec", "radec_corr")
-    polar_names = ("separation", "position_angle", "seppa_corr")
-    for pair, (first, second, corr) in (
-        ((sky.imag, sky.real), sky_names),
-        ((np.abs(sky), np.rad2deg(np.angle(sky)) % 360), polar_names),
+    polar = np.abs(sky), np.rad2deg(np.angle(sky)) % 360
+    for pair, names, corr in (
+        ((sky.imag, sky.real), ("delta_ra", "delta_dec"), "radec_corr"),
+        (polar, ("separation", "position_angle"), "seppa_corr"),
     ):
-        for values, name in zip(pair, (first, second), strict=True):
+        for values, name in zip(pair, names, strict=True):
             error = row[f"{name}_error"].value
             assert row[name].value == pytest.approx(values.mean(), abs=0.02 * error)
             assert error == pytest.approx(values.std(), rel=0.02)
@@ -170,52 +153,51 @@ def test_the_flux_of_a_planet_does_not_have_the_error_of_the_stars_flux():
     assert row["ab_mag_error"].value == pytest.approx(2.5 / np.log(10) * share)
 
 
-@pytest.mark.parametrize("sigmas", [3.0, 5.0])
-def test_what_is_not_detected_has_an_upper_limit(sigmas):
+def test_what_is_not_detected_has_an_upper_limit():
     snr = np.array([-1.0, 2.0, 4.0, 9.0])
     raw = QTable({"x": [0.5] * 4 * u.arcsec, "y": [0.1] * 4 * u.arcsec, "contrast": 1e-6 * snr,
                   "contrast_error": np.full(4, 1e-6), "snr": snr})  # fmt: skip
-    got = measured_table(raw, np.zeros((2, 4)), SKY, sigmas)
-    expected = np.array([sigmas, 2 + sigmas, 4 + sigmas, np.nan]) * 1e-6
-    expected[snr >= sigmas] = np.nan
+    got = measured_table(raw, np.zeros((2, 4)), SKY, 5.0)
+    expected = np.array([5.0, 7.0, 9.0, np.nan]) * 1e-6
     np.testing.assert_allclose(got["upper_limit"], expected)
     np.testing.assert_allclose(got["upper_limit_delta_mag"].value, -2.5 * np.log10(expected))
     np.testing.assert_allclose(got["upper_limit_flux_density"].to_value("Jy"), 0.4 * expected)
     # A negative flux has no magnitude.
     np.testing.assert_array_equal(np.isnan(got["delta_mag"].value), snr < 0)
-    assert got.meta["sigmas"] == sigmas
+    assert got.meta["sigmas"] == 5
     place = Positions(np.array([[0.5, 0.1]]), COVARIANCE[None], NORTH).on_sky[0]
     np.testing.assert_allclose([got["delta_ra"][0].value, got["delta_dec"][0].value], place)
 
 
-@pytest.mark.parametrize("made", ["candidates", "measured", "curve"])
-def test_a_table_shows_its_contrasts_on_80_columns(made):
-    ring = [np.full(4, 1.23456789e-6)] * 2
+def test_tables_show_their_contrasts_on_80_columns():
     raw = QTable({"x": [0.5] * u.arcsec, "y": [0.1] * u.arcsec, "contrast": [1.23e-6],
                   "contrast_error": [1e-6], "snr": [1.23]})  # fmt: skip
-    shown = {
-        "candidates": table(),
-        "measured": measured_table(raw, np.zeros((2, 1)), SKY, 5.0),
-        "curve": contrast_table(
-            np.array([0.5, 0.6]), ring, ring, 0.14, ErrorFactor.constant(1.5), 0.4
-        ),
-    }[made]
-    header, *lines = shown.pformat(max_width=80)
-    assert max(map(len, (header, *lines))) <= 80
-    assert "contrast" in header.split()
-    assert ("snr" in header.split()) == (made != "curve")
-    assert all(shown[name].info.description for name in shown.colnames)
+    measured, ring = (
+        measured_table(raw, np.zeros((2, 1)), SKY, 5.0),
+        [np.full(2, 1.23456789e-6)] * 2,
+    )
+    curve = contrast_table(np.array([0.5, 0.6]), ring, ring, 0.14, ErrorFactor.constant(1.5), 0.4)
+    for shown in (table(), measured, curve):
+        header, *lines = shown.pformat(max_width=80)
+        assert max(map(len, (header, *lines))) <= 80
+        assert "contrast" in header.split()
+        assert all(shown[name].info.description for name in shown.colnames)
 
 
 def fitted(observation):
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=16)
-    return cast(
-        "FrameFit",
-        SimpleNamespace(
-            observation=observation, model=model, opd=np.zeros((128, 128)), flux=2e7,
-            optical_values={}, errors={"flux": np.array([1e6])}, start={},
-        ),
+    return SimpleNamespace(
+        observation=observation, model=model, opd=np.zeros((128, 128)), flux=2e7,
+        optical_values={}, errors={"flux": np.array([1e6])}, start={},
     )  # fmt: skip
+
+
+def sky_of(*frames, catalogue_error=None, scatter=1.0):
+    opd = dr.random_opd(1, npix=128)
+    fit = SimpleNamespace(
+        frames=frames, catalogue_error=catalogue_error, catalogue_flux=None, initial=opd
+    )
+    return Sky.of([fit], scatter=scatter)
 
 
 def test_the_stop_passes_what_arrives_of_a_star_without_the_occulter():
@@ -239,11 +221,7 @@ def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path):
     assert scale == pytest.approx(frame.model.transmission() * REAL["PIXAR_SR"] * 1e6)
     # The posterior's 5 %, doubled, and the 10 % that it does not know of, unless there is a prior.
     for known, share in ((None, math.hypot(0.1, 0.1)), (0.05, math.hypot(0.1, 0.05))):
-        opd = dr.random_opd(1, npix=128)
-        fit = SimpleNamespace(
-            frames=[frame], catalogue_error=known, catalogue_flux=None, initial=opd
-        )
-        value, error = cast("tuple[float, float]", Sky.of(cast("Any", [fit]), scatter=2.0).star)
+        value, error = sky_of(frame, catalogue_error=known, scatter=2.0).star
         assert value == pytest.approx(2e7 * scale)
         assert error == pytest.approx(share * value)
     # What is not calibrated has no flux density.
@@ -253,14 +231,12 @@ def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path):
         require_calibrated(got)
 
 
-@pytest.mark.parametrize(
-    "star", [0.36308, "0.36308 Jy", 363.08 * u.mJy, 10.0 * u.ABmag, "363.08 mJy"]
-)
+@pytest.mark.parametrize("star", [0.36308, "363.08 mJy", 363.08 * u.mJy, 10.0 * u.ABmag])
 def test_the_stars_flux_may_be_given_in_any_unit(star):
     assert to_jansky(star) == pytest.approx(0.36308, rel=1e-4)
 
 
-@pytest.mark.parametrize("star", [0, -1.0, math.nan, math.inf, "bright", 3 * u.m, None, [0.1, 0.2]])
+@pytest.mark.parametrize("star", [0, math.nan, "bright", 3 * u.m, None, [0.1, 0.2]])
 def test_what_is_no_flux_is_refused(star):
     with pytest.raises(IncompatibleSetupError, match=r"star_flux: got .* expected a"):
         to_jansky(star)
@@ -271,57 +247,45 @@ def test_the_epoch_is_the_middle_of_the_exposures(tmp_path):
     first = observation(tmp_path / "a")
     later = observation(tmp_path / "b", EXPMID=None, **{"DATE-BEG": "2022-10-03T16:00:00"})
     assert first.mid_date.mjd == REAL["EXPMID"]
-    frames = [fitted(first), fitted(later)]
-    opd = dr.random_opd(1, npix=128)
-    fit = SimpleNamespace(frames=frames, catalogue_error=None, catalogue_flux=None, initial=opd)
-    fits_ = cast("Any", [fit])
-    sky = Sky.of(fits_)
+    sky = sky_of(fitted(first), fitted(later))
     assert sky.mjd == pytest.approx((REAL["EXPMID"] + 59855 + 16 / 24) / 2, abs=1e-8)
     assert sky.date == Time(sky.mjd, format="mjd").isot[:19]
     assert set(table(sky)["epoch_mjd"]) == {sky.mjd}
 
 
-def test_orbitize_reads_the_astrometry(tmp_path):
-    """As its `read_file` does: astropy's reader, MJD, integers, mas and degrees."""
+def test_programs_that_fit_orbits_read_the_astrometry(tmp_path):
+    """As their own readers do, of which backtracks and orvara take columns by their place."""
     known = table()
-    path = write_astrometry(known, tmp_path / "astrometry.csv", "orbitize")
-    read = ascii.read(path)
-    assert list(read["object"]) == [1, 2]
-    assert isinstance(read[0]["object"], np.int64)
-    np.testing.assert_allclose(read["epoch"], 59855.5)
-    for name, column in (("raoff", "delta_ra"), ("decoff", "delta_dec"), ("sep", "separation")):
-        np.testing.assert_allclose(read[name], known[column].to_value("mas"), rtol=1e-6)
-        error = known[f"{column}_error"].to_value("mas")
-        np.testing.assert_allclose(read[f"{name}_err"], error, rtol=1e-5)
-    np.testing.assert_allclose(read["pa"], known["position_angle"].to_value("deg"), rtol=1e-6)
-    np.testing.assert_allclose(read["radec_corr"], known["radec_corr"], rtol=1e-5)
-
-
-def test_backtracks_and_octofitter_read_the_astrometry(tmp_path):
-    """backtracks takes columns by their place, as in its `System`; Octofitter by their names."""
-    known = table()
-    ra, error = (known[name].to_value("mas") for name in ("delta_ra", "delta_ra_error"))
-    dec = known["delta_dec"].to_value("mas")
-    rows = ascii.read(write_astrometry(known, tmp_path / "b.csv", "backtracks"))
-    assert list(rows["quant_type"]) == ["radec", "radec"]
-    for place, expected in ((0, [59855.5] * 2), (2, ra), (3, error), (4, dec),
-                            (6, known["radec_corr"])):  # fmt: skip
-        np.testing.assert_allclose(rows.columns[place], expected, rtol=1e-5)
-    rows = ascii.read(write_astrometry(known, tmp_path / "o.csv", "octofitter"))
-    for name, expected in (("epoch", [59855.5] * 2), ("ra", ra), ("σ_ra", error), ("dec", dec),
-                           ("cor", known["radec_corr"])):  # fmt: skip
-        np.testing.assert_allclose(rows[name], expected, rtol=1e-5)
-
-
-def test_orvara_reads_the_astrometry(tmp_path):
-    known = table()
-    path = write_astrometry(known, tmp_path / "relAst.txt", "orvara")
-    read = np.genfromtxt(path, usecols=range(7))
-    np.testing.assert_allclose(read[:, 0], 2459856.0)
-    np.testing.assert_allclose(read[:, 1], known["separation"].to_value("arcsec"), rtol=1e-6)
-    np.testing.assert_allclose(read[:, 4], known["position_angle_error"].to_value("deg"), rtol=1e-5)
-    np.testing.assert_allclose(read[:, 5], known["seppa_corr"], rtol=1e-5)
-    np.testing.assert_array_equal(read[:, 6], [0, 1])
+    ra, dec, separation, ra_error, separation_error = (
+        known[name].to_value("mas")
+        for name in ("delta_ra", "delta_dec", "separation", "delta_ra_error", "separation_error")
+    )
+    angle, angle_error = (known[f"position_angle{k}"].to_value("deg") for k in ("", "_error"))
+    orbitize = {
+        "object": [1, 2], "epoch": 59855.5, "raoff": ra, "raoff_err": ra_error, "decoff": dec,
+        "sep": separation, "sep_err": separation_error, "pa": angle,
+        "radec_corr": known["radec_corr"],
+    }  # fmt: skip
+    octofitter = {
+        "epoch": 59855.5, "ra": ra, "σ_ra": ra_error, "dec": dec, "cor": known["radec_corr"]
+    }  # fmt: skip
+    backtracks = {0: 59855.5, 2: ra, 3: ra_error, 4: dec, 6: known["radec_corr"]}
+    orvara = {
+        0: 2459856.0, 1: separation / 1000, 4: angle_error, 5: known["seppa_corr"], 6: [0, 1]
+    }  # fmt: skip
+    rows = ascii.read(write_astrometry(known, tmp_path / "orbitize.csv", "orbitize"))
+    assert isinstance(rows[0]["object"], np.int64)
+    by_place = ascii.read(write_astrometry(known, tmp_path / "backtracks.csv", "backtracks"))
+    assert list(by_place["quant_type"]) == ["radec", "radec"]
+    by_name = ascii.read(write_astrometry(known, tmp_path / "octofitter.csv", "octofitter"))
+    plain = np.genfromtxt(
+        write_astrometry(known, tmp_path / "relAst.txt", "orvara"), usecols=range(7)
+    )
+    for read, expected in (
+        (rows, orbitize), (by_place.columns, backtracks), (by_name, octofitter), (plain.T, orvara)
+    ):  # fmt: skip
+        for column, values in expected.items():
+            np.testing.assert_allclose(read[column], values, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -336,26 +300,3 @@ def test_an_orbit_needs_angle_and_date(sky, format, message, tmp_path):
     with pytest.raises(IncompatibleSetupError, match=message):
         write_astrometry(table(sky), tmp_path / "astrometry.csv", format)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.study  # Three minutes.
-def test_the_companion_of_hip_65426_is_on_its_side_of_the_star(shared_data):
-    """The header's roll is a placeholder, but the telescope keeps its shade towards the sun.
-
-    Its V3 axis points away from the sun, within some degrees. The companion's published position
-    angle, 149.9 degrees, minus that of the frame, is the angle of this axis. A mirrored image
-    would be wrong by 58 degrees.
-    """
-    frames = shared_data / "hip65426_f444w_calints.fits.gz"
-    opd = shared_data / "opd_2022-07-30.fits.gz"
-    detection = dr.reduce(frames, opd, size=48).detection
-    row = detection.candidates[0]
-    assert row["separation"].to_value("mas") == pytest.approx(820, abs=25)
-    header = detection.observation.header
-    star = SkyCoord(header["CRVAL1"], header["CRVAL2"], unit="deg")
-    sun = get_sun(Time("2022-07-30"))
-    nominal = star.position_angle(SkyCoord(sun.ra, sun.dec)).deg + 180
-    v3 = 149.9 - row["position_angle"].to_value("deg")
-    assert (v3 - nominal + 180) % 360 - 180 == pytest.approx(0, abs=8)
-    # 15.47 mag in F444W, of which magnitude 0 is 184 Jy.
-    assert row["flux_density"].to_value("Jy") == pytest.approx(1.2e-4, rel=0.5)

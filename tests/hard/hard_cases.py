@@ -4,11 +4,10 @@ A row is measured by the tests, which hold it to its limits, and by
 ``benchmarks/stability.py``, which prints it into the documentation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import contextmanager
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,19 +26,11 @@ difference of fields 20 times as large; 1e-6 plane by plane, 8e-6 on the lattice
 2.1e-5 with torch 2.6, whose sums are ordered differently."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One line of the table.
+class Row(NamedTuple):
+    """One line of the table: what it is, what could go wrong, what the user sees.
 
-    Attributes
-    ----------
-    case, trouble, sees : str
-        What it is, what could go wrong, what the user sees.
-    limits : (float, float)
-        Largest error in float64 and in float32.
-    measure : callable
-        Real dtype to an error, relative, so that an answer of zeros has an error of 1 and one
-        scaled by 1 % an error of 0.01.
+    The limits are for float64 and float32. `measure` takes a real dtype and gives an error,
+    relative, so that an answer of zeros has an error of 1 and one scaled by 1 % an error of 0.01.
     """
 
     case: str
@@ -77,22 +68,16 @@ def segment(npix=NPIX):
     return (SegmentMotions().modes(PupilGrid.full(npix), 6, 7)[0] > 0.5).double()
 
 
-def array(image):
-    """Any image as a float64 array."""
-    if isinstance(image, torch.Tensor):
-        image = image.detach().numpy()
-    return np.asarray(image, dtype=np.float64)
+@contextmanager
+def threads(count):
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    yield
+    torch.set_num_threads(before)
 
 
 def worst(image, truth):
     """Largest difference of two images as a fraction of the peak; NaN counts as infinite."""
-    got, true = array(image), array(truth)
+    got, true = (np.asarray(torch.as_tensor(each).detach().double()) for each in (image, truth))
     difference = np.abs(got - true).max() / np.abs(true).max()
-    return float(difference) if np.isfinite(difference) else float("inf")
-
-
-def distance(vector, truth):
-    """Length of a difference as a fraction of the length of the truth."""
-    got, true = array(vector), array(truth)
-    difference = np.linalg.norm(got - true) / np.linalg.norm(true)
     return float(difference) if np.isfinite(difference) else float("inf")

@@ -5,38 +5,23 @@ What counts is the rms error of the fitted star, in units of the noise, over all
 not: a fit that reports success must be right, one that cannot be must say so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
+import noisy_stars
 import numpy as np
 import torch
 from hard_cases import WAVELENGTH, segment
-from numpy.typing import NDArray
 
-from pyklip_diffrender.instrument import nircam_coronagraph
+import pyklip_diffrender as dr
 from pyklip_diffrender.optics import PupilGrid
-from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine
-from pyklip_diffrender.scene import Observation, Planet
-from pyklip_diffrender.wavefront import (
-    FourierModes,
-    JointBasis,
-    SegmentMotions,
-    WavefrontPrior,
-    random_opd,
-)
-
-__all__ = [
-    "FITS", "PRIOR", "SUCCESS", "FitRow", "Pistons", "drift_rms", "error_of",
-    "fitted", "model", "noise", "observed", "old", "piston_of_segments", "star",
-]  # fmt: skip
-
-Array = NDArray[np.float64]
+from pyklip_diffrender.refinement import Refinement, Status
+from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
 
 NPIX, SIZE = 64, 24
-FLUX, BACKGROUND, READ_NOISE = 1e11, 500.0, 42.0
+FLUX, BACKGROUND = 1e11, 500.0
 OFFSET = (0.002, -0.001)
 FEW = FourierModes(3)
 MORE = JointBasis([SegmentMotions(), FEW])
@@ -49,13 +34,13 @@ parameters that it determines take up about 40 of 576 pixels, an error of 0.26 s
 @lru_cache(maxsize=2)
 def model(dtype=torch.float64):
     """24 x 24 pixels."""
-    return nircam_coronagraph(monochromatic=WAVELENGTH, npix=NPIX, fov_pixels=SIZE, dtype=dtype)
+    return dr.nircam_coronagraph(monochromatic=WAVELENGTH, npix=NPIX, fov_pixels=SIZE, dtype=dtype)
 
 
 @lru_cache(maxsize=1)
 def old():
     """The wavefront that fits start from, m."""
-    return random_opd(3, npix=NPIX).data
+    return dr.random_opd(3, npix=NPIX).data
 
 
 @lru_cache(maxsize=1)
@@ -78,7 +63,7 @@ def star(opd=None):
 
 def noise(truth=None):
     """Standard deviation of every pixel."""
-    return np.sqrt((star() if truth is None else truth) + BACKGROUND + READ_NOISE**2)
+    return np.sqrt((star() if truth is None else truth) + BACKGROUND + noisy_stars.READ_NOISE**2)
 
 
 def planet(*planets):
@@ -93,10 +78,7 @@ def planet(*planets):
 
 def observed(truth, seed=2):
     """A frame of it, with noise."""
-    rng = np.random.default_rng(seed)
-    counts = rng.poisson(truth + BACKGROUND) + rng.normal(0, READ_NOISE, truth.shape)
-    error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
-    return Observation.from_arrays(counts, error, pixelscale=0.062424185, name="hard case")
+    return noisy_stars.observed(truth + BACKGROUND, seed, 0.062424185, name="hard case")
 
 
 def error_of(image, truth=None):
@@ -108,32 +90,21 @@ def error_of(image, truth=None):
 def fitted(frame, opd=None, dtype=torch.float64, **options):
     """The fit, from the old wavefront unless another is given."""
     start = options.pop("start", None)
-    settings = GaussNewton(**{"basis": FEW, "response_npix": NPIX, **options})
-    begin = old() if opd is None else opd
-    return refine(model(dtype), frame, begin, settings=settings, start=start)
+    settings = dr.GaussNewton(**{"basis": FEW, "response_npix": NPIX, **options})
+    return dr.refine(
+        model(dtype), frame, old() if opd is None else opd, settings=settings, start=start
+    )
 
 
 # -- what no image shows -----------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Pistons:
-    """What a fit with free segments says of the mean of their pistons.
-
-    Attributes
-    ----------
-    fit : Refinement
-    together, error : float
-        Projection of the coefficients on it, of unit length, and its posterior deviation, nm.
-    coefficients, errors : ndarray, (54,)
-        Of all segment motions.
-    """
+class Pistons(NamedTuple):
+    """A fit with free segments; the mean of their pistons, of unit length, and its error, nm."""
 
     fit: Refinement
     together: float
     error: float
-    coefficients: Array
-    errors: Array
 
 
 PRIOR = 4.0
@@ -142,16 +113,13 @@ PRIOR = 4.0
 
 def piston_of_segments():
     """18 pistons are free; what they have in common is invisible."""
-    prior = WavefrontPrior({"segment": PRIOR, "texture": 3.0}, fit_scales=False)
+    prior = dr.WavefrontPrior({"segment": PRIOR, "texture": 3.0}, fit_scales=False)
     fit = fitted(observed(star()), basis=MORE, prior=prior)
     found = fit.frames[0].coefficients
     covariance = fit.linear.covariance.numpy()[-len(MORE) :, -len(MORE) :]
     mean = np.zeros(len(MORE))
     mean[:54:3] = 18**-0.5
-    return Pistons(
-        fit, float(mean @ found), float(np.sqrt(mean @ covariance @ mean)), found[:54],
-        np.sqrt(np.diag(covariance))[:54],
-    )  # fmt: skip
+    return Pistons(fit, float(mean @ found), float(np.sqrt(mean @ covariance @ mean)))
 
 
 # -- what is done to the frame -----------------------------------------------------------------
@@ -159,17 +127,15 @@ def piston_of_segments():
 
 def _missing(share):
     frame = observed(star())
-    valid = np.random.default_rng(9).random(frame.data.shape) >= share
-    return replace(frame, valid=valid)
+    return replace(frame, valid=np.random.default_rng(9).random(frame.data.shape) >= share)
 
 
 def _saturated(flagged):
     """The brightest 3 % of the pixels are full."""
     frame = observed(star())
     full = float(np.quantile(frame.data, 0.97))
-    return replace(
-        frame, data=np.minimum(frame.data, full), valid=~((frame.data >= full) & flagged)
-    )
+    valid = ~((frame.data >= full) & flagged)
+    return replace(frame, data=np.minimum(frame.data, full), valid=valid)
 
 
 def _hit(flagged, sigma=1000.0, count=10):
@@ -186,26 +152,17 @@ def _wave(waves):
     return _now() + waves * WAVELENGTH * segment(NPIX).numpy()
 
 
-@dataclass(frozen=True)
-class FitRow:
-    """A line of the table of fits.
+class FitRow(NamedTuple):
+    """A line of the table of fits, how it may end, and the largest error of its star.
 
-    Attributes
-    ----------
-    case, trouble, sees : str
-    ends : tuple of Status
-        How it may end.
-    run : callable
-        Real dtype to (fit, error of its star in sigma).
-    limit : float
-        Largest error.
+    `run` takes a real dtype and gives the fit and that error, sigma.
     """
 
     case: str
     trouble: str
     sees: str
     ends: tuple[Status, ...]
-    run: Callable[[torch.dtype], tuple[Refinement, float]]
+    run: Callable
     limit: float = SUCCESS
 
 
@@ -219,9 +176,9 @@ def _row(case, trouble, sees, make, *ends, limit=SUCCESS, truth=star, start=old,
 
 _FAILED = (Status.MODEL_MISMATCH, Status.ITERATION_LIMIT, Status.DIVERGED)
 _ANY = float("inf")
-_BRIGHT = Planet(1e-3, 0.55, 40.0)
-_NEAR = Planet(1e-4, 0.3, 40.0)
-_EDGE = Planet(1e-3, 11.5 * 0.062424185, 90.0)
+_BRIGHT = dr.Planet(1e-3, 0.55, 40.0)
+_NEAR = dr.Planet(1e-4, 0.3, 40.0)
+_EDGE = dr.Planet(1e-3, 11.5 * 0.062424185, 90.0)
 
 FITS = [
     _row("nothing hard", "", "converged", lambda: observed(star())),
