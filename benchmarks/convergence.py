@@ -11,23 +11,18 @@ It writes reports/accuracy.md; docs/validation/optics.md has the results. poppy'
 from __future__ import annotations
 
 import argparse
-import sys
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks import poppy_reference as reference
 from benchmarks.compared import Array, largest
 from benchmarks.provenance import provenance
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.optics.system import OpticalSystem
-
-TESTS = Path(__file__).resolve().parents[1] / "tests"
-sys.path.insert(0, str(TESTS))
-reference = import_module("poppy_reference")
 
 WAVELENGTH = 4.5e-6
 SEPARATIONS = (0.0, 0.01, 0.05, 0.3, 0.6, 1.5, 2.3)
@@ -49,7 +44,7 @@ def main() -> None:
     parser.add_argument("--npix", type=int, default=1024)
     parser.add_argument("--poppy-oversample", type=int, nargs="*", default=[2, 4, 8])
     parser.add_argument("--sampling", type=int, nargs="*", default=[2, 4, 8])
-    parser.add_argument("--output", type=Path, default=TESTS.parent / "reports" / "accuracy.md")
+    parser.add_argument("--output", type=Path, default=Path("reports") / "accuracy.md")
     arguments = parser.parse_args()
     npix = arguments.npix
     zernikes, opd = reference.lopsided_zernikes(), reference.lopsided_opd(npix)
@@ -130,7 +125,7 @@ def main() -> None:
                 f"{npix} x {npix} samples in the pupil, MASK335R and MASKRND, {WAVELENGTH * 1e6:g} "
                 "um, 80 x 80 pixels, a wavefront and internal aberrations without any symmetry "
                 f"(60 and {rms:.0f} nm rms). `poppy` is an `OpticalSystem` put together "
-                "independently (`tests/poppy_reference.py`) with that FFT oversampling, `ours` is "
+                "independently (`poppy_reference`) with that FFT oversampling, `ours` is "
                 "`nircam_coronagraph` with that `occulter_sampling`. In the table: the largest "
                 "difference from the converged image as a fraction of the image's peak; the "
                 "peak as a fraction of the light that the pupil collects.",

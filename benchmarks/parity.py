@@ -26,6 +26,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks import poppy_reference as reference
+from benchmarks import stpsf_data
 from benchmarks.compared import Array, largest, timed
 from benchmarks.provenance import provenance
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf, load_wss_opd
@@ -36,8 +38,6 @@ from pyklip_diffrender.optics.system import OpticalSystem
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path.insert(0, str(TESTS))
-reference = import_module("poppy_reference")
-stpsf_data = import_module("stpsf_data")
 parity = import_module("test_parity_stpsf")
 
 
@@ -301,7 +301,7 @@ def main() -> None:
                 *provenance("-m benchmarks.parity", ("poppy", "stpsf", "pysiaf")),
                 "",
                 f"{npix} x {npix} samples in the pupil, 80 x 80 pixels, 4.5 um unless another band "
-                "is named. stpsf runs on an offline data directory (`tests/stpsf_data.py`) whose "
+                "is named. stpsf runs on an offline data directory (`stpsf_data`) whose "
                 "pupil, wavefront, Lyot stop and internal aberrations have no symmetry, so that "
                 "no flipped or transposed answer passes. Errors are the largest difference "
                 "divided by the peak unless they say otherwise.",

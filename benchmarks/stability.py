@@ -10,18 +10,13 @@ It writes reports/stability.md. ``pytest --full -m hard`` holds every line to it
 from __future__ import annotations
 
 import argparse
-import sys
-from importlib import import_module
 from pathlib import Path
 
 import torch
 
+from benchmarks import stability_fits as fits
+from benchmarks import stability_optics as optics
 from benchmarks.provenance import provenance
-
-TESTS = Path(__file__).resolve().parents[1] / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "hard")]
-optics = import_module("stability_optics")
-fits = import_module("stability_fits")
 
 INTRODUCTION = """# Numerical stability
 
@@ -29,7 +24,7 @@ Written by a script; do not edit.
 
 What has broken codes of this kind, measured on small grids. `pytest -m hard` holds every line to
 its limit, and tests what has no number: gradients at exact zeros, masked pixels, damaged files,
-processes that are killed. The cases are defined in `tests/hard`.
+processes that are killed.
 """
 
 OPTICS = """
@@ -113,7 +108,7 @@ def notes() -> dict[str, float]:
 def main() -> None:
     """Measure, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", type=Path, default=TESTS.parent / "reports" / "stability.md")
+    parser.add_argument("--output", type=Path, default=Path("reports") / "stability.md")
     arguments = parser.parse_args()
     star = fits.star()
     facts = {

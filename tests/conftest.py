@@ -123,7 +123,7 @@ def stpsf_path(tmp_path_factory):
     """An offline data directory with 256 samples across the pupil, set as STPSF_PATH."""
     if importlib.util.find_spec("stpsf") is None:
         pytest.skip("needs stpsf, the extra 'webbpsf'")
-    from stpsf_data import make_stpsf_data
+    from benchmarks.stpsf_data import make_stpsf_data
 
     folder = make_stpsf_data(tmp_path_factory.mktemp("stpsf") / "data", npix=256)
     with pytest.MonkeyPatch.context() as patch:

@@ -9,13 +9,13 @@ from itertools import product
 import astropy.units as u
 import numpy as np
 import poppy
-import poppy_reference as reference
 import pytest
 import random_poppy
 import torch
 from astropy.io import fits
 from poppy.poppy_core import PlaneType
 
+from benchmarks import poppy_reference as reference
 from pyklip_diffrender.bridges import from_poppy, opd_to_poppy
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.optics.grid import resample

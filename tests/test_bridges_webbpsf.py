@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-import stpsf_data
 import torch
 from astropy import units as u
 from astropy.io import fits
 from derivatives import slopes
-from stpsf_data import lopsided, pupil, zernike_tensor
 
+from benchmarks import stpsf_data
+from benchmarks.stpsf_data import lopsided, pupil, zernike_tensor
 from pyklip_diffrender.bridges import from_webbpsf, opd_to_webbpsf
 from pyklip_diffrender.errors import (
     CorruptFileError,

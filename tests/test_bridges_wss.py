@@ -8,8 +8,8 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import Table
 from astropy.time import Time
-from stpsf_data import nircam, pupil, wss_file
 
+from benchmarks.stpsf_data import nircam, pupil, wss_file
 from pyklip_diffrender.bridges import from_webbpsf, load_wss_opd, load_wss_opd_by_date, opd_to_hdus
 from pyklip_diffrender.errors import (
     CorruptFileError,

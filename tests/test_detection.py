@@ -15,9 +15,9 @@ from astropy.time import Time
 from astropy.units import Unit
 from astropy.wcs import WCS
 from matplotlib.figure import Figure
-from noisy_stars import drift, drifted_star
 
 import pyklip_diffrender as dr
+from benchmarks.noisy_stars import drift, drifted_star
 from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.detection.candidates import with_companions
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError

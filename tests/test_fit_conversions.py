@@ -16,9 +16,9 @@ from astropy import units as u
 from astropy.io import fits
 from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
-from stpsf_data import lopsided
 
 import pyklip_diffrender as dr
+from benchmarks.stpsf_data import lopsided
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf
 from pyklip_diffrender.instrument import maskrnd_openings
 from pyklip_diffrender.optics import OpticalSystem, PupilGrid, polygon_coverage

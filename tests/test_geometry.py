@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from astropy.io import fits
-from stpsf_data import official_files
 
+from benchmarks.stpsf_data import official_files
 from pyklip_diffrender.instrument import jwst_pupil, maskrnd_openings
 from pyklip_diffrender.optics import (
     JWST_DIAMETER,

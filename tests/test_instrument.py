@@ -11,8 +11,8 @@ import scipy.ndimage
 import torch
 from astropy.io import fits
 from astropy.table import Table
-from stpsf_data import official_files
 
+from benchmarks.stpsf_data import official_files
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import (
     FILTERS,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
-from stpsf_data import wss_file
 
+from benchmarks.stpsf_data import wss_file
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,

@@ -10,8 +10,8 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from stpsf_data import lyot_stop, nircam, official_files
 
+from benchmarks.stpsf_data import lyot_stop, nircam, official_files
 from pyklip_diffrender.bridges import from_webbpsf
 from pyklip_diffrender.instrument import (
     FLIGHT_ALIGNMENT,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import poppy_reference as reference
 import pytest
 
+from benchmarks import poppy_reference as reference
 from pyklip_diffrender.instrument import (
     NIRCAM_LW_PIXELSCALE,
     jwst_pupil,

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from noisy_stars import READ_NOISE, DriftedStar, drifted_star
 from scipy import optimize
 
 import pyklip_diffrender as dr
+from benchmarks.noisy_stars import READ_NOISE, DriftedStar, drifted_star
 from pyklip_diffrender import errors
 from pyklip_diffrender.instrument.jwst import maskrnd_openings
 from pyklip_diffrender.optics import PupilGrid, polygon_coverage

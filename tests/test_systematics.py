@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from noisy_stars import READ_NOISE, drifted_star
 from scipy.ndimage import gaussian_filter
 
 import pyklip_diffrender as dr
+from benchmarks.noisy_stars import READ_NOISE, drifted_star
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.pattern import measure
 from pyklip_diffrender.refinement import Status, refine_again

@@ -5,10 +5,10 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-import stability_fits as hard
 import torch
-from hard_cases import DTYPES, small, threads, wavefront
 
+from benchmarks import stability_fits as hard
+from benchmarks.hard_cases import DTYPES, small, threads, wavefront
 from pyklip_diffrender import errors
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene import Observation, Scene, simulate

@@ -4,9 +4,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from hard_cases import DTYPES, WAVELENGTH, small, system, threads, wavefront, worst
-from stability_optics import ROWS
 
+from benchmarks.hard_cases import DTYPES, WAVELENGTH, small, system, threads, wavefront, worst
+from benchmarks.stability_optics import ROWS
 from pyklip_diffrender.bridges import image_masks as masks
 from pyklip_diffrender.io import ARCSEC
 from pyklip_diffrender.optics import JWST_DIAMETER, MatrixFourier, PupilGrid, Wavefront

@@ -10,12 +10,12 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
-import noisy_stars
 import numpy as np
 import torch
-from hard_cases import WAVELENGTH, segment
 
 import pyklip_diffrender as dr
+from benchmarks import noisy_stars
+from benchmarks.hard_cases import WAVELENGTH, segment
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.refinement import Refinement, Status
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions

@@ -5,9 +5,10 @@ from functools import lru_cache, partial
 
 import mpmath
 import numpy as np
-import poppy_reference as reference
 import torch
-from hard_cases import (
+
+from benchmarks import poppy_reference as reference
+from benchmarks.hard_cases import (
     FLOAT32_IMAGE,
     NPIX,
     WAVELENGTH,
@@ -18,7 +19,6 @@ from hard_cases import (
     wavefront,
     worst,
 )
-
 from pyklip_diffrender.instrument import MASKS, NIRCAM_LW_PIXELSCALE, jwst_pupil, maskrnd_openings
 from pyklip_diffrender.optics import PupilGrid, polygon_coverage
 from pyklip_diffrender.scene import Planet, Scene, expected_photons, planet_photons, star_photons
