@@ -295,14 +295,47 @@ def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, c
     assert {path.name: opened[path.name] for path in files} == {path.name: 2 for path in files}
 
 
-@pytest.mark.parametrize("exposure", ["03106", "03107"], ids=["F444W", "F356W"])
-def test_real_pairs_are_the_same_in_both_doors(exposure, shared_data, tmp_path, calls, monkeypatch):
+def with_companion(path, folder):
+    """A copy of a file with a source as bright as AU Mic's background star, 1.2 arcsec away."""
+    copy = folder / path.name.removesuffix(".gz")
+    with fits.open(path) as hdus:
+        science = hdus["SCI"]
+        x, y = (science.header[key] - 1 for key in ("CRPIX1", "CRPIX2"))
+        rows, columns = np.indices(science.shape[-2:])
+        square = (columns - x - 15) ** 2 + (rows - y - 12) ** 2
+        science.data += (300 * np.exp(-square / 2.5)).astype(np.float32)
+        hdus.writeto(copy)
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("visits", "exposure", "door", "companion"),
+    [
+        ("34", "03106", through_klip_dataset, False),
+        ("34", "03107", through_klip_dataset, False),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("12", "03106", through_klip_dataset, False),
+                ("12", "03107", through_klip_dataset, False),
+                ("56", "03107", through_klip_dataset, True),
+                ("56", "03106", through_spaceklip, True),
+                ("56", "03106", through_a_survey, True),
+            )
+        ),
+    ],
+)
+def test_real_pairs_are_the_same_in_every_door(
+    visits, exposure, door, companion, shared_data, tmp_path, calls, monkeypatch
+):
     """The frames, the map and the pattern of the library, without a fit."""
     monkeypatch.setattr("pyklip_diffrender.pattern.choice.package_library", package_library)
-    files = sorted((shared_data / "gto1184").glob(f"jw0118400[34]001_{exposure}*"))
+    files = sorted((shared_data / "gto1184").glob(f"jw0118400[{visits}]001_{exposure}*"))
     assert len(files) == 2
-    for each in (through_reduce, through_klip_dataset):
-        with contextlib.suppress(Stopped):
+    if companion:
+        files = [with_companion(each, tmp_path) for each in files]
+    for each in (through_reduce, door):
+        with contextlib.suppress(Stopped, ExceptionGroup, DiffrenderError):
             each(files, tmp_path)
     assert_same_call(*calls)
 

@@ -12,6 +12,7 @@ import importlib
 import inspect
 import re
 import shlex
+import tomllib
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -252,3 +253,13 @@ def test_the_first_example_gives_what_the_page_says(tmp_path, monkeypatch, capsy
     for line in stated.splitlines():
         assert line.strip() in shown
     assert (tmp_path / "products" / "candidates.ecsv").exists()
+
+
+def test_the_version_is_the_same_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    for name, phrase in {
+        "CITATION.cff": "version: {}\n",
+        "docs/reference/citation.md": "version = {{{}}}",
+        "CHANGELOG.md": "## [{}] - ",
+    }.items():
+        assert phrase.format(project["version"]) in (ROOT / name).read_text("utf-8"), name
