@@ -664,4 +664,6 @@ def test_segments_of_an_exposure_are_one_roll(folder):
     assert (first.count, second.count) == (3, 1)
     assert first.name == f"{FIRST} and 1 more"
     assert len(first.noise_ratios) == len(first) == 2
-    assert uses(sequence)["seg2.fits"] == "target"
+    assert first.cutout(40).combined().count == 3
+    rows = {row["file"]: (row["use"], row["integrations"]) for row in sequence.table}
+    assert rows["seg2.fits"] == ("target", 2)

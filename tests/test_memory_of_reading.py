@@ -87,15 +87,6 @@ def test_means_take_at_most_one_and_a_half_times_their_file(tmp_path, monkeypatc
         np.testing.assert_allclose(means.combined().data, frames.combined().data, atol=1e-5)
 
 
-def test_a_sequence_counts_the_integrations_of_its_means(tmp_path):
-    sequence = dr.Sequence.from_files([plain(tmp_path)])
-    assert len(sequence.science[0]) == 1
-    assert sequence.science[0].count == MANY - 2
-    assert sequence.science[0].cutout(40).combined().count == MANY - 2
-    (row,) = sequence.table
-    assert row["integrations"] == MANY - 2
-
-
 def test_pyklip_datasets_take_about_twice_their_file(tmp_path, monkeypatch):
     """What pyKLIP holds itself included: its frames take a third of the file."""
     JWST = pytest.importorskip("pyklip.instruments.JWST")
