@@ -296,7 +296,7 @@ def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, c
 
 
 def with_companion(path, folder):
-    """A copy of a file with a source as bright as AU Mic's background star, 1.2 arcsec away."""
+    """A copy of a file with a source of 300 MJy/sr at its brightest, 1.2 arcsec away."""
     copy = folder / path.name.removesuffix(".gz")
     with fits.open(path) as hdus:
         science = hdus["SCI"]
