@@ -1,7 +1,5 @@
 """Small datasets for the tests of the backend, with a star that can be rendered exactly."""
 
-from __future__ import annotations
-
 import numpy as np
 from astropy.io import fits
 from pyklip.parallelized import klip_dataset

@@ -13,8 +13,6 @@ At the oldest end, deprecation warnings are not errors: old releases get them fr
 underneath, and only their authors could act on them.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

@@ -4,8 +4,6 @@ Plain ``pytest`` leaves out what is marked ``slow`` and tries few examples in ea
 ``pytest --full`` runs everything but what needs a GPU; ``pytest -m gpu`` runs that.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal

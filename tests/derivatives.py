@@ -1,7 +1,5 @@
 """Derivatives by automatic differentiation, and by differences that share no code with it."""
 
-from __future__ import annotations
-
 import torch
 
 from pyklip_diffrender.linear import field_derivatives, image_derivatives

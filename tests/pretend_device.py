@@ -5,8 +5,6 @@ every derivative too, and what an accelerator would refuse is refused: operation
 on both devices, and arrays of numpy that share a tensor's memory.
 """
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 
 import torch

@@ -1,7 +1,5 @@
 """Random systems of poppy: rotations, masks, stops, grey and uniform planes in any order."""
 
-from __future__ import annotations
-
 import numpy as np
 import poppy
 from astropy import units as u

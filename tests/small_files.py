@@ -1,7 +1,5 @@
 """Small calibrated files, with headers as the JWST pipeline writes them."""
 
-from __future__ import annotations
-
 import numpy as np
 from astropy.io import fits
 

@@ -1,7 +1,5 @@
 """Small inputs, configurations and cheap jobs for the tests of surveys."""
 
-from __future__ import annotations
-
 __all__ = ["HOSTILE", "configuration", "inputs", "result", "stub"]
 
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>'

@@ -1,7 +1,5 @@
 """Admission: what real folders contain, what is used of it, and why the rest is not."""
 
-from __future__ import annotations
-
 import gzip
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Data flows one way, and importing the package is cheap."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

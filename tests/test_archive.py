@@ -1,7 +1,5 @@
 """Files from MAST, by a stub of astroquery that answers and fails as the real one does."""
 
-from __future__ import annotations
-
 import inspect
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``algo="diffrender"`` in pyKLIP: the contract of `klip_dataset`, on datasets without headers."""
 
-from __future__ import annotations
-
 import copy
 import ctypes
 import inspect

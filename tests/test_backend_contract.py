@@ -1,7 +1,5 @@
 """The backend with a pipeline's own subclass of `Data`, in other threads, and in processes."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import subprocess

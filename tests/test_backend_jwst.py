@@ -1,7 +1,5 @@
 """``algo="diffrender"`` on JWSTData: the recorded pixels, errors, flags and headers are used."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 

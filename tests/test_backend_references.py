@@ -1,7 +1,5 @@
 """``algo="diffrender"`` with reference stars: which pattern is used, and from which frames."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from pathlib import Path

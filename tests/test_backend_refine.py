@@ -1,7 +1,5 @@
 """``algo="diffrender"`` end to end: a rendered star, an outdated wavefront, a script as usual."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import re

@@ -1,7 +1,5 @@
 """Wavefront modes: their size, place and orientation, and that sums and windows agree."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 Doors are `reduce`, `klip_dataset` with ``algo="diffrender"``, `spaceklip.run_obs` and a survey.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`from_poppy` against poppy itself: same samples, so only rounding may differ."""
 
-from __future__ import annotations
-
 import copy
 import re
 from itertools import product

@@ -1,7 +1,5 @@
 """`from_webbpsf` against the real stpsf, on an offline data directory without symmetry."""
 
-from __future__ import annotations
-
 import copy
 import sys
 from functools import partial

@@ -1,7 +1,5 @@
 """Wavefront-sensing files, against stpsf's own loader."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from astropy import units as u

@@ -5,8 +5,6 @@ formatted, and put into the phrase, which the document has to contain: the test 
 disagrees, and if the phrase is gone.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

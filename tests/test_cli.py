@@ -1,7 +1,5 @@
 """The command line: what it writes, what it refuses before any work, and where errors go."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

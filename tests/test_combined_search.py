@@ -1,7 +1,5 @@
 """One search over filters and epochs: exact, calibrated, and honest about what it leaves out."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

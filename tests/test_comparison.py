@@ -1,7 +1,5 @@
 """Epochs and filters of a star: candidates that move with it, background sources, colours."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Extended light is told from point sources by its extent, however narrow it is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

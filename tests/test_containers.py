@@ -1,7 +1,5 @@
 """Masks and units of every container of numbers: container x mask x unit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Fits that go on from one another: more modes, other settings."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

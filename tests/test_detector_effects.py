@@ -1,7 +1,5 @@
 """Every effect of the detector against the library whose numerics it repeats."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.ndimage

@@ -1,7 +1,5 @@
 """The detector's own pixels: undoing a shift, the library of patterns, finding lost pixels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -5,8 +5,6 @@ is computed takes the arguments of `model_on`, and returns arrays that do not de
 beyond rounding.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

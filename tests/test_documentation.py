@@ -3,8 +3,6 @@
 Code cells of the tutorials are run by the build of the documentation.
 """
 
-from __future__ import annotations
-
 import ast
 import builtins
 import doctest

@@ -1,7 +1,5 @@
 """The gates for numbers and files: units, byte order, broken files, products never half written."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import threading

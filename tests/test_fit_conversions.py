@@ -5,8 +5,6 @@ user's object with the later wavefront in it, and the planet from the same objec
 moved.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``pyklip.fm.klip_dataset`` with ``algo="diffrender"``: the forward model of a planet."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

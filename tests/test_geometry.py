@@ -1,7 +1,5 @@
 """Pupil shapes: exact areas, orientation, smooth motion."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

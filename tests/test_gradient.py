@@ -1,7 +1,5 @@
 """Derivatives of a fit through the model itself, and accurate steps with them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

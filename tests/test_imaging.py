@@ -1,7 +1,5 @@
 """The image of the sky is the posterior mean in closed form, and has north up."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """NIRCam's embedded facts: what the numbers do in a model, and where they come from."""
 
-from __future__ import annotations
-
 import itertools
 from functools import partial
 

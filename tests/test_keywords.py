@@ -1,7 +1,5 @@
 """The package's own FITS keywords have one declaration, and products one form of each."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

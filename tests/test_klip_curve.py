@@ -1,7 +1,5 @@
 """KLIP's contrast curve for the frames of a reduction."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Point sources on the detector's lattice: what the model gives for each of them."""
 
-from __future__ import annotations
-
 import pickle
 
 import pytest

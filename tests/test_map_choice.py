@@ -1,7 +1,5 @@
 """Choosing a wavefront map by its date."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

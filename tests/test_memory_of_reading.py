@@ -1,7 +1,5 @@
 """Files of many integrations are read in about as much memory as they are large."""
 
-from __future__ import annotations
-
 import gc
 import gzip
 import tracemalloc

@@ -1,7 +1,5 @@
 """Errors of real frames, calibrated far from the star."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Observations: JWST files, data quality, star position, cut-outs, weighted means, bad input."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

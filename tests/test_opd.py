@@ -1,7 +1,5 @@
 """Wavefront maps: units, broken and odd files, and the seeded generators."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The optical system: conventions, energy, derivatives, bad input."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

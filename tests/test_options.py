@@ -1,7 +1,5 @@
 """Options of a reduction are declared once: Python, command line, surveys and pages follow."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 from dataclasses import fields

@@ -3,8 +3,6 @@
 `benchmarks/parity.py` measures the same at 1024 and writes reports/parity.md.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the `plot` methods draw: the numbers, where they are, and what is said about them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Models in forked processes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Progress: what a terminal shows, and what goes to the log."""
 
-from __future__ import annotations
-
 import logging
 
 from pyklip_diffrender.io import ProgressBar, progress, stage

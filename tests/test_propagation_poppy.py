@@ -1,7 +1,5 @@
 """The compact-occulter propagation against poppy's plain FFTs, made finer until they settle."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

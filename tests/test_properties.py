@@ -1,7 +1,5 @@
 """What holds for every shape, wavefront and flux, tried on many."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import pytest

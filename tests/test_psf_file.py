@@ -1,7 +1,5 @@
 """PSF files of the embedded system: what a user of poppy's instruments expects."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Quantities: every length, angle, time, flux and temperature takes one in any unit."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

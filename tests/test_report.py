@@ -1,7 +1,5 @@
 """The report: what it says is what was measured, and headers cannot change the page."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Jacobians of the image against differences of the model, and the priors that weigh them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

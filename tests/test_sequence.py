@@ -1,7 +1,5 @@
 """Sequences from files, patterns learned from reference stars, and fits that survive a file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The short-wave arm and module B: frames like those of MAST, from reading to the planet."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Simulated scenes: the paper's photons, where planets appear, noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The example for SLURM, with an `sbatch` that runs jobs on this machine."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`spaceklip.run_obs` on a stand-in for a spaceKLIP database, and on a real one where installed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Products that are written as they come, and reductions that are resumed."""
 
-from __future__ import annotations
-
 import copy
 import json
 from dataclasses import replace

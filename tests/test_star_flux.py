@@ -1,7 +1,5 @@
 """The flux of the star, to which contrasts refer: of a fit, of a catalogue, of its spectrum."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """FITS files by their suffix, and texts with a byte-order mark, wherever files are read."""
 
-from __future__ import annotations
-
 import gzip
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Surveys: what is asked for is checked, what is finished is kept, what fails is said."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Surveys as real processes that are killed, and inputs that are damaged."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

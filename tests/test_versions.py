@@ -1,7 +1,5 @@
 """The versions that the metadata promises: all bounded, and kept by what is installed."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 

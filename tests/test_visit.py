@@ -1,7 +1,5 @@
 """Frames of reference stars in one likelihood with those of the target."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
