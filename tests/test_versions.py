@@ -3,8 +3,9 @@
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 
-from check_versions import lower_bounds
 from packaging.version import Version
+
+from benchmarks.check_versions import lower_bounds
 
 
 def test_what_is_installed_is_no_older_than_the_metadata_allow():

@@ -1,8 +1,8 @@
 """Run the tests with the oldest and with the newest libraries that the metadata allow.
 
-    python tests/check_versions.py                     # all three, the quick tier
-    python tests/check_versions.py --end oldest        # one of them
-    python tests/check_versions.py -- tests/test_optics.py -x
+    python -m benchmarks.check_versions                     # all three, the quick tier
+    python -m benchmarks.check_versions --end oldest        # one of them
+    python -m benchmarks.check_versions -- tests/test_optics.py -x
 
 Each end gets a fresh virtual environment with this interpreter and is removed afterwards. The
 oldest end pins every lower bound of ``pyproject.toml`` (the dependencies and the extras that users
