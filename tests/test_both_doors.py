@@ -166,7 +166,7 @@ def through_spaceklip(files, folder):
     database = StandIn(folder, {KEY: concatenation([str(path) for path in files])})
     options = {"opd": map_file(folder), "fit_pixels": SIZE, "fit": settings_of(files)}
     detection = spaceklip.run_obs(database, **options)[KEY]
-    (fit,) = detection.fits
+    fit = detection.fits[0]
     return Answer(fit, detection, name_of(fit.systematics))
 
 
