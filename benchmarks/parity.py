@@ -14,12 +14,10 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-import sys
 import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -27,35 +25,45 @@ import numpy as np
 import torch
 
 from benchmarks import poppy_reference as reference
-from benchmarks import stpsf_data
 from benchmarks.compared import Array, largest, timed
+from benchmarks.parity_cases import BARE, CALL, EMBEDDED, FULL, differences
 from benchmarks.provenance import provenance
+from benchmarks.stpsf_data import make_stpsf_data, nircam, wss_file
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf, load_wss_opd
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.optics.system import OpticalSystem
 
-TESTS = Path(__file__).resolve().parents[1] / "tests"
-sys.path.insert(0, str(TESTS))
-parity = import_module("test_parity_stpsf")
-
-
-# Case of the test suite, what is compared, at most.
-ROWS = (
-    ("on axis", "nd_squares off, on axis", 1e-8),
-    ("0.6 arcsec", "nd_squares off, star at 0.6 arcsec", 1e-8),
-    ("2 arcsec", "nd_squares off, star at 2 arcsec", 1e-8),
-    ("ND squares", "nd_squares on, on axis", 1e-7),
-    ("ND squares, 0.6 arcsec", "nd_squares on, star at 0.6 arcsec", 1e-7),
-    ("F444W, 9 wavelengths", "broadband F444W, 9 wavelengths", 1e-8),
-    ("F335M, 9 wavelengths", "broadband F335M, 9 wavelengths", 1e-8),
-    ("pupil shift, rotation, offset", "pupil shift, rotation and source offset", 1e-7),
-    ("MASK430R", "MASK430R", None),
-    ("MASK210R", "MASK210R, F200W", None),
-    ("MASKLWB", "MASKLWB", None),
-    ("MASKSWB", "MASKSWB, F200W", None),
-)
+BROAD = {"monochromatic": None, "nlambda": 9, "fft_oversample": 4}
+SHORT = {"monochromatic": 2.0e-6}
+NEAR = {"source_offset_x": -0.2, "source_offset_y": 0.57}
+MOVED = {
+    "pupil_shift_x": 0.012, "pupil_shift_y": -0.02, "pupil_rotation": 1.3,
+    "source_offset_x": 0.02, "source_offset_y": 0.01,
+}  # fmt: skip
+DISTORTED = ("nd_squares on, on axis", "pupil shift, rotation and source offset")
+# What is compared: options of the instrument, arguments of the call, and the largest error.
+ROWS: dict[str, tuple[dict[str, Any], dict[str, Any], float | None]] = {
+    "nd_squares off, on axis": (BARE, {}, 1e-8),
+    "nd_squares off, star at 0.6 arcsec": (
+        {**BARE, "source_offset_x": 0.5, "source_offset_y": -0.33}, {}, 1e-8,
+    ),
+    "nd_squares off, star at 2 arcsec": (
+        {**BARE, "source_offset_r": 2.0, "source_offset_theta": 50.0}, {}, 1e-8,
+    ),
+    "nd_squares on, on axis": ({}, {}, 1e-7),
+    "nd_squares on, star at 0.6 arcsec": (NEAR, {}, 1e-7),
+    "broadband F444W, 9 wavelengths": (BARE, BROAD, 1e-8),
+    "broadband F335M, 9 wavelengths": ({**BARE, "band": "F335M"}, BROAD, 1e-8),
+    "pupil shift, rotation and source offset": (MOVED, {}, 1e-7),
+    "MASK430R": ({"image_mask": "MASK430R"}, {}, None),
+    "MASK210R, F200W": ({"image_mask": "MASK210R", "band": "F200W"}, SHORT, None),
+    "MASKLWB": ({"image_mask": "MASKLWB", "pupil_mask": "MASKLWB"}, {}, None),
+    "MASKSWB, F200W": (
+        {"image_mask": "MASKSWB", "pupil_mask": "MASKSWB", "band": "F200W"}, SHORT, None,
+    ),
+}  # fmt: skip
 
 
 def run(model: OpticalSystem) -> tuple[Array, float]:
@@ -100,18 +108,17 @@ def against_poppy(npix: int) -> list[str]:
 
 
 def against_stpsf(folder: Path, npix: int, oversample: int) -> list[str]:
-    """Every case of the test suite that the table asks for."""
+    """The rows of the table."""
     lines = []
-    for case, words, limit in ROWS:
-        options, changes = parity.CASES[case]
-        call = {**parity.CALL, "fft_oversample": oversample, "detector_oversample": 1, **changes}
-        instrument = parity.nircam(folder, npix, **options)
+    for words, (options, changes, limit) in ROWS.items():
+        call = {**CALL, "fft_oversample": oversample, "detector_oversample": 1, **changes}
+        instrument = nircam(folder, npix=npix, **options)
         truth = instrument.calc_psf(**call)
         error = largest(image_of(from_webbpsf(instrument, **call)), truth["DET_SAMP"].data)
         most = "reported" if limit is None else f"{limit:g}"
         whose = f"stpsf, fft_oversample {call['fft_oversample']}"
         lines.append(line(whose, f"image / peak, {words}", most, error))
-        if case in ("ND squares", "pupil shift, rotation, offset"):
+        if words in DISTORTED:
             distorted = image_of(from_webbpsf(instrument, add_distortion=True, **call))
             error = largest(distorted, truth["DET_DIST"].data)
             lines.append(line("stpsf, DET_DIST", f"image / peak, {words}", "1e-05", error))
@@ -120,7 +127,7 @@ def against_stpsf(folder: Path, npix: int, oversample: int) -> list[str]:
 
 def oversampled_chain(folder: Path, npix: int) -> str:
     """DET_DIST with the detector oversampled, as stpsf does by default."""
-    instrument = parity.nircam(folder, npix)
+    instrument = nircam(folder, npix=npix)
     call = {"monochromatic": 4.5e-6, "fov_pixels": 80, "oversample": 4}
     image = image_of(from_webbpsf(instrument, add_distortion=True, **call))
     error = largest(image, instrument.calc_psf(**call)["DET_DIST"].data)
@@ -130,8 +137,8 @@ def oversampled_chain(folder: Path, npix: int) -> str:
 
 def precision(folder: Path, npix: int) -> list[str]:
     """float32 against float64."""
-    instrument = parity.nircam(folder, npix)
-    call = {**parity.CALL, "fft_oversample": 4, "detector_oversample": 1}
+    instrument = nircam(folder, npix=npix)
+    call = {**CALL, "fft_oversample": 4, "detector_oversample": 1}
     weight = torch.from_numpy(np.random.default_rng(335).standard_normal((80, 80)))
     images, gradients = [], []
     for dtype in (torch.float64, torch.float32):
@@ -150,8 +157,8 @@ def precision(folder: Path, npix: int) -> list[str]:
 def wavefront_sensing(folder: Path, npix: int) -> str:
     """`load_wss_opd` against stpsf's."""
     path = folder / "R2022081102-NRCA3_FP1-1.fits"
-    stpsf_data.wss_file(path)
-    instrument = parity.nircam(folder, npix)
+    wss_file(path)
+    instrument = nircam(folder, npix=npix)
     instrument.load_wss_opd(str(path), verbose=False)
     loaded = load_wss_opd(path, npix=npix)
     error = float(np.abs(loaded.data - instrument.pupilopd[0].data).max())
@@ -162,17 +169,18 @@ def wavefront_sensing(folder: Path, npix: int) -> str:
 def on_official_files(folder: Path) -> list[str]:
     """Two tables: converted models, and the embedded coronagraph in rings about the star."""
     converted = []
-    for case, words in (("ND squares, 0.6 arcsec", "F444W, MASK335R, star at 0.6 arcsec"),
-                        ("pupil shift, rotation, offset", "stop shifted and turned")):  # fmt: skip
-        instrument = parity.nircam(folder, 1024, **parity.CASES[case][0])
-        call = {**parity.FULL, "monochromatic": 4.5e-6}
+    for options, words in (
+        (NEAR, "F444W, MASK335R, star at 0.6 arcsec"), (MOVED, "stop shifted and turned"),
+    ):  # fmt: skip
+        instrument = nircam(folder, npix=1024, **options)
+        call = {**FULL, "monochromatic": 4.5e-6}
         truth = instrument.calc_psf(**call)
         for distorted, name in ((False, "DET_SAMP"), (True, "DET_DIST")):
             image = image_of(from_webbpsf(instrument, add_distortion=distorted, **call))
             converted.append(line(words, name, largest(image, truth[name].data)))
     rings = [
-        line(case, *(f"{100 * x:.2f} %" for x in parity.differences(folder, case, {})))
-        for case in parity.EMBEDDED
+        line(case, *(f"{100 * x:.2f} %" for x in differences(folder, case, {})))
+        for case in EMBEDDED
     ]
     return [
         "| converted model | extension | largest difference / peak |",
@@ -211,8 +219,8 @@ def speed(folder: Path, npix: int, oversample: int) -> list[str]:
     """One monochromatic image, the star on the axis, each against its own limit."""
     lines = []
     for squares in (False, True):
-        instrument = parity.nircam(folder, npix, nd_squares=squares)
-        call = {**parity.CALL, "detector_oversample": 1, "add_distortion": False}
+        instrument = nircam(folder, npix=npix, nd_squares=squares)
+        call = {**CALL, "detector_oversample": 1, "add_distortion": False}
         truth = instrument.calc_psf(**{**call, "fft_oversample": oversample})[1].data
         call["fft_oversample"] = 4
 
@@ -263,13 +271,13 @@ def main() -> None:
     parser.add_argument("--official", type=Path, help="STScI's data directory for stpsf")
     parser.add_argument("--speed", action="store_true", help="measure speed anew")
     parser.add_argument("--oversample", type=int, default=8, help="of stpsf's FFTs")
-    parser.add_argument("--output", type=Path, default=TESTS.parent / "reports" / "parity.md")
+    parser.add_argument("--output", type=Path, default=Path("reports") / "parity.md")
     arguments = parser.parse_args()
     npix, oversample = arguments.npix, arguments.oversample
     logging.disable(logging.WARNING)
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as scratch:
-        folder = stpsf_data.make_stpsf_data(Path(scratch) / "stpsf-data", npix)
+        folder = make_stpsf_data(Path(scratch) / "stpsf-data", npix)
         os.environ["STPSF_PATH"] = str(folder)
         # First, while nothing else has filled the memory.
         faster = speed(folder, npix, oversample) if arguments.speed else []

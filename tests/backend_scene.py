@@ -1,6 +1,7 @@
 """Small datasets for the tests of the backend, with a star that can be rendered exactly."""
 
 import numpy as np
+import small_files
 from astropy.io import fits
 from pyklip.parallelized import klip_dataset
 
@@ -98,26 +99,13 @@ def calints(path, rng, roll=0.0, center=(20.7, 25.2), nints=2, **cards):
     flags = np.zeros(data.shape, np.uint32)
     flags[:, 30, 30], data[:, 30, 30] = 1, 5e3
     flags[:, 8, 9] = 512
-    primary = fits.Header(
-        {
-            "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "FILTER": "F444W",
-            "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "XOFFSET": 0.0, "YOFFSET": 0.0,
-            "DATE-BEG": "2022-07-30T01:02:03", "TARGPROP": "TARGET", **cards,
-        }
+    primary = {
+        "TELESCOP": "JWST", "EXP_TYPE": "NRC_CORON", "PUPIL": "MASKRND", "CORONMSK": "MASKA335R",
+        "XOFFSET": 0.0, "YOFFSET": 0.0, "DATE-BEG": "2022-07-30T01:02:03", "TARGPROP": "TARGET",
+    }  # fmt: skip
+    small_files.calints(
+        path, data.astype(np.float32), np.full(data.shape, 0.05, np.float32), flags,
+        primary={**primary, **cards}, PIXAR_A2=0.062424185**2, CRPIX1=center[0] + 1,
+        CRPIX2=center[1] + 1, CRVAL1=201.0, CRVAL2=-51.0, ROLL_REF=roll, V3I_YANG=0.0,
     )  # fmt: skip
-    science = fits.Header(
-        {
-            "BUNIT": "MJy/sr", "PIXAR_A2": 0.062424185**2, "CRPIX1": center[0] + 1,
-            "CRPIX2": center[1] + 1, "CRVAL1": 201.0, "CRVAL2": -51.0, "ROLL_REF": roll,
-            "V3I_YANG": 0.0, "VPARITY": -1,
-        }
-    )  # fmt: skip
-    fits.HDUList(
-        [
-            fits.PrimaryHDU(header=primary),
-            fits.ImageHDU(data.astype(np.float32), science, name="SCI"),
-            fits.ImageHDU(np.full(data.shape, 0.05, np.float32), name="ERR"),
-            fits.ImageHDU(flags, name="DQ"),
-        ]
-    ).writeto(path)
     return data

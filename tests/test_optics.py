@@ -16,7 +16,6 @@ from pyklip_diffrender.instrument import (
     filter_throughput,
     nircam_coronagraph,
 )
-from pyklip_diffrender.instrument.spectrum import blackbody
 from pyklip_diffrender.io import ARCSEC
 from pyklip_diffrender.optics import JWST_DIAMETER, Bandpass
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
@@ -267,12 +266,6 @@ def test_polynomials_keep_their_sums(band, count):
     assert count == 9 or moment(few, 2 * count) != pytest.approx(moment(band, 2 * count), rel=1e-6)
     assert BAND.condensed(5) is BAND
     assert BAND.width == pytest.approx(1.05 / 4.4175)
-
-
-def test_blackbody_has_wiens_peak():
-    grid = np.linspace(1e-7, 4e-6, 100_000)
-    # Photons per wavelength peak at lambda T = 3.6697e-3 m K.
-    assert grid[blackbody(5000.0, grid).argmax()] * 5000 == pytest.approx(3.6697e-3, rel=1e-4)
 
 
 def test_a_given_spectrum_is_used():

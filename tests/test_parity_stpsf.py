@@ -3,16 +3,14 @@
 `benchmarks/parity.py` measures the same at 1024 and writes reports/parity.md.
 """
 
-from functools import cache
-
 import numpy as np
 import pytest
 import torch
 
+from benchmarks.parity_cases import BARE, CALL, EMBEDDED, FULL, MIDDLE, differences
 from benchmarks.stpsf_data import lyot_stop, nircam, official_files
 from pyklip_diffrender.bridges import from_webbpsf
 from pyklip_diffrender.instrument import (
-    FLIGHT_ALIGNMENT,
     MASKS,
     BarMask,
     detector_place,
@@ -22,9 +20,7 @@ from pyklip_diffrender.instrument import (
 from pyklip_diffrender.optics import JWST_DIAMETER, LyotStop, OpticalSystem
 
 NPIX = 256
-CALL = {"monochromatic": 4.5e-6, "fft_oversample": 4, "detector_oversample": 2, "fov_pixels": 80}
 SHORT = {"monochromatic": 2.0e-6}
-BARE = {"nd_squares": False}
 
 ALIGNED = {
     "pupil_shift_x": 0.012, "pupil_shift_y": -0.02, "pupil_rotation": 1.3,
@@ -110,9 +106,6 @@ def official(shared_data, monkeypatch):
     return folder
 
 
-FULL = {"fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 80}
-
-
 # Every mask in both channels: stpsf's apertures by filter.
 PLACES = {
     "F200W": (
@@ -126,8 +119,6 @@ PLACES = {
         "NRCB5_MASK430R", "NRCB5_MASKLWB",
     ),
 }  # fmt: skip
-MIDDLE = {"bar_offset": 0.0}
-"""Where a bar of module B has its aperture; stpsf takes a filter's place in module A."""
 
 
 def mask_and_place(aperture):
@@ -194,33 +185,6 @@ def test_the_embedded_transmission_is_that_of_stpsf(stpsf_path, band, aperture):
     assert np.abs(mine - truth).max() <= (1e-14 if ours.stop == "MASKRND" else 1e-8)
 
 
-# A wavelength of a filter, and that at which stpsf has no wedge tilt.
-WAVES = {"F444W": (4.5e-6, 3.35e-6), "F356W": (3.5e-6, 3.35e-6), "F210M": (2.05e-6, 2.10e-6)}
-B = {"module": "B"}
-# Mask and filter; stpsf's options, ours, and the limit on the mean difference in units of the mean
-# light there: the ends of bars are sharp; in module A it is the same.
-EMBEDDED = {
-    "MASK335R": ("MASK335R", "F444W", {}, {}, 5e-3),
-    "MASK430R, module B": ("MASK430R", "F356W", {"aperture": "NRCB5_MASK430R"}, B, 5e-3),
-    "MASK210R, module B": ("MASK210R", "F210M", {"aperture": "NRCB1_MASK210R"}, B, 5e-3),
-    "MASKSWB, module B": (
-        "MASKSWB", "F210M", {"aperture": "NRCB3_MASKSWB", "pupil_mask": "MASKSWB", **MIDDLE}, B,
-        0.01,
-    ),
-    "MASKLWB, module B": (
-        "MASKLWB", "F444W", {"aperture": "NRCB5_MASKLWB", "pupil_mask": "MASKLWB", **MIDDLE}, B,
-        0.01,
-    ),
-    "flight pupil": ("MASK335R", "F444W", {"pupil": "flight"}, {"pupil": "flight"}, 5e-3),
-    # Published for stpsf's options; poppy cuts the shifts to 13 and 7 samples.
-    "flight alignment": (
-        "MASK335R", "F444W",
-        {"pupil_shift_x": -0.01347, "pupil_shift_y": -0.00762, "pupil_rotation": -0.567},
-        {"defaults": FLIGHT_ALIGNMENT}, 5e-3,
-    ),
-    # The table's row, against what stpsf interpolates between field points: 5 nm of astigmatism.
-    "embedded aberrations": ("MASK335R", "F444W", {}, {"si_wfe": True}, 0.01),
-}  # fmt: skip
 # Changes that a test with such limits must notice.
 WRONG = (
     {"flip_si_wfe": False},
@@ -228,36 +192,6 @@ WRONG = (
     {"image_mask": "MASK430R", "pixelscale": 0.062424185},
     {"defaults": {"lyot_shift": (0.0, 0.002)}},
 )
-
-
-OFFSET = (0.05, -0.03)
-"""Of the star from the mask, arcsec."""
-
-
-@cache
-def by_stpsf(official, case):
-    """Image, OPD, and the Zernike coefficients of the instrument."""
-    mask, band, options, _, _ = EMBEDDED[case]
-    offset = dict(zip(("source_offset_x", "source_offset_y"), OFFSET, strict=True))
-    options = {**BARE, "jitter": None, **offset, **options}
-    instrument = nircam(official, npix=1024, band=band, image_mask=mask, **options)
-    call = {**FULL, "monochromatic": WAVES[band][0]}
-    image = instrument.calc_psf(**call, add_distortion=False)[1].data
-    opd = from_webbpsf(instrument, **call).entrance.opd
-    return image, opd, instrument._get_aberrations().zernike_coeffs
-
-
-def differences(official, case, wrong):
-    """Mean difference between the embedded coronagraph and stpsf, and the mean light, in rings."""
-    mask, band, _, ours, _ = EMBEDDED[case]
-    wavelength, tilt_free = WAVES[band]
-    truth, opd, aberrations = by_stpsf(official, case)
-    settings = {"image_mask": mask, "si_wfe": aberrations, "chromatic_reference": tilt_free}
-    model = nircam_coronagraph(band, monochromatic=wavelength, **{**settings, **ours, **wrong})
-    error = np.abs(model(opd, OFFSET).numpy() - truth)
-    radius = np.hypot(*(np.mgrid[:80, :80] - 39.5))
-    rings = [(a <= radius) & (radius < b) for a, b in ((0, 5), (5, 11), (11, 19), (19, 38))]
-    return [float(error[ring].mean() / truth[ring].mean()) for ring in rings]
 
 
 @pytest.mark.slow
