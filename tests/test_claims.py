@@ -371,6 +371,13 @@ def test_how_often_real_frames_are_not_explained():
     assert phrase in (ROOT / "docs/howto/status.md").read_text(encoding="utf-8")
 
 
+def test_the_page_of_real_frames_has_few_numbers():
+    text = (ROOT / PAGE).read_text(encoding="utf-8")
+    for pattern in SETTINGS[:2]:
+        text = re.sub(pattern, "", text)
+    assert 60 < len(re.findall(r"(?<![\w.])\d[\d.]*(?:e-?\d+)?", text)) <= 120
+
+
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*.ecsv")), ids=lambda path: path.name)
 def test_tables_say_when_and_how_they_were_made(path):
     found = Table.read(path)

@@ -32,14 +32,6 @@ def test_coverage_has_the_exact_area(npix):
     assert coverage.max() <= 1 + 1e-12
 
 
-def test_coverage_of_a_known_triangle():
-    # Pixels of side 1 from -2 to 2; the triangle (-1, -1), (1, -1), (-1, 1) halves two of four.
-    grid = PupilGrid.full(4, 4.0)
-    triangle = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64)
-    expected = [[0, 0, 0, 0], [0, 1, 0.5, 0], [0, 0.5, 0, 0], [0, 0, 0, 0]]
-    np.testing.assert_allclose(polygon_coverage([triangle], grid), expected, atol=1e-12)
-
-
 def test_coverage_in_a_window_is_the_window_of_the_coverage():
     full = PupilGrid.full(90)
     window = PupilGrid(90, JWST_DIAMETER, (20, 71), (33, 80))

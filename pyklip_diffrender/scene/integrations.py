@@ -287,7 +287,8 @@ def judge_integrations(
     """
     group = np.arange(len(data)) if group is None else group
     kept = np.ones(len(data), dtype=bool)
-    if len(group) < _FEW:
+    # A single row or column has no slopes.
+    if len(group) < _FEW or min(data.shape[1:]) < 2:
         return Judgement(kept, ())
     # The star may move by a twentieth of a pixel between integrations and its light change by 3 %.
     # Larger deviations that are significant are masked; an integration is left out if they are a

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import small_files
 from astropy.io import fits
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.fuzz_intake import make_frames, run
@@ -238,15 +238,15 @@ def test_a_damaged_card_is_an_error_of_this_package(kind, old, new, path):
     assert result is None
 
 
-SHAPES = st.lists(st.integers(2, 5), min_size=1, max_size=4).map(tuple)
+SHAPES = st.lists(st.integers(1, 5), min_size=1, max_size=4).map(tuple)
 
 
 @given(shapes=st.tuples(SHAPES, SHAPES, SHAPES), equal=st.tuples(st.booleans(), st.booleans()))
+@example(shapes=((5, 1, 4), (5,), (5,)), equal=(False, False))
 def test_calints_of_any_shapes(shapes, equal, path):
     """Right if all three are the same two or three axes, else an error."""
-    science, error, quality = (
-        s if k else shapes[0] for s, k in zip(shapes, (1, *equal), strict=True)
-    )
+    science = shapes[0]
+    error, quality = (s if k else science for s, k in zip(shapes[1:], equal, strict=True))
     rng = np.random.default_rng(3)
     data, noise = rng.normal(size=science), rng.uniform(1, 2, size=error)
     calints(data, noise, np.zeros(quality, dtype=np.uint32)).writeto(path, overwrite=True)
