@@ -6,9 +6,9 @@ Run from the root of the project::
 
 FRAMES is the folder with the calints files of programme 1184. A source is added to both rolls of
 G 7-34 in F444W, as the fit of the untouched files renders it, with photon noise and the errors that
-it adds, but without the flat-field pattern, which real companions hardly show. The changed files are
-reduced with the defaults. A row says whether both files were used as before, whether the source is
-among the companions of the fit and the candidates, its measured contrast and position, what else
+it adds, but without the flat-field pattern, which real companions hardly show. The changed files
+are reduced with the defaults. A row says whether both files were used as before, whether the source
+is among the companions of the fit and the candidates, its measured contrast and position, what else
 was found, and the ratio of the limits further than 1.5 lambda/D from it to those without it.
 """
 
