@@ -220,13 +220,6 @@ class PatternChoice:
         return ", ".join(f"{origin} ({', '.join(names)})" for origin, names in parts if names)
 
     @property
-    def reference_frames(self) -> int:
-        """Number of frames of reference stars that the pattern was learned from."""
-        if self.systematics is None:
-            return 0
-        return sum(frame.observation.count for fit in self.references for frame in fit.frames)
-
-    @property
     def has_other_flat_field(self) -> bool:
         """Whether the frames were calibrated with another flat field than those of the library.
 

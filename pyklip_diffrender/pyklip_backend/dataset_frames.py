@@ -309,7 +309,7 @@ class _File(NamedTuple):
 
 
 class OpenedFile(NamedTuple):
-    """What a file holds, for `reduce` and as pyKLIP reads it.
+    """Contents of a file, for `reduce` and as pyKLIP reads it.
 
     Attributes
     ----------

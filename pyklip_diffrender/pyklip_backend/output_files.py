@@ -1,4 +1,4 @@
-"""What a reduction writes: images, throughput, and complete files with their provenance."""
+"""Products of a dataset's reduction: images, throughput, and complete files with provenance."""
 
 from __future__ import annotations
 

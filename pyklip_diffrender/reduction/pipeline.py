@@ -279,7 +279,7 @@ class ReductionResult:
 
     @property
     def _references(self) -> str:
-        """What the frames of reference stars are for, in a line; empty without any."""
+        """Use of the frames of reference stars, in a line; empty without any."""
         every = self.visit.contributions
         used = sum(each.use == "joint" for each in every)
         if not every:
@@ -303,7 +303,7 @@ class ReductionResult:
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What a reduction that is resumed has done before."""
+    """Results so far of a reduction that was interrupted and is resumed."""
 
     # Names of the stages: search, disk, wide, injections, completeness.
     done: frozenset[str]
@@ -327,7 +327,7 @@ class Checkpoint:
 
 
 class Keeper(Protocol):
-    """What keeps the products of a reduction as they come, such as a `ProductFolder`."""
+    """Receiver of the products of a reduction as they come, such as a `ProductFolder`."""
 
     def begin(self, sequence: Sequence, opd: OPDMap, options: ReduceOptions) -> Checkpoint | None:
         """Return what an interrupted reduction of the same frames has done; else None."""
