@@ -173,10 +173,10 @@ def __getattr__(name: str) -> Any:
 
 
 def _watch_in_spawned_process() -> None:
-    """Load the backend in a process that was spawned in a `backend` block, see its `child`."""
+    """Load the backend in a process that was spawned in a `backend` block, see its `patch`."""
     if "PYKLIP_DIFFRENDER_TAKES_KLIP" in os.environ:
-        child = import_module(f"{__name__}.pyklip_backend.child")
-        if child.spawned_beside_klip():
+        patch = import_module(f"{__name__}.pyklip_backend.patch")
+        if patch.spawned_beside_klip():
             import_module(f"{__name__}.pyklip_backend.registration")
 
 

@@ -1,4 +1,4 @@
-"""Data flows one way, and importing the package is cheap."""
+"""Data flows one way, importing the package is cheap, and its requirements are what it needs."""
 
 import ast
 import json
@@ -6,11 +6,15 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
+from packaging.version import Version
 
 import pyklip_diffrender as dr
+from benchmarks.check_versions import lower_bounds
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "pyklip_diffrender"
@@ -196,3 +200,11 @@ def test_type_checkers_see_the_names_that_are_loaded_lazily():
     typed = {name.removeprefix(f"{PACKAGE}.") for _, name in imported_names(guarded, PACKAGE)}
     assert typed == {f"{module}.{name}" for name, module in dr._MODULE_OF.items()}
     assert set(dr.__all__) == {*dr._MODULE_OF, "__version__"}
+
+
+def test_what_is_installed_is_no_older_than_the_metadata_allow():
+    bounds = lower_bounds()
+    assert {"torch", "numpy", "jinja2", "dask", "pyarrow", "astroquery", "stpsf"} <= set(bounds)
+    for name, bound in bounds.items():
+        with suppress(PackageNotFoundError):  # of an extra
+            assert Version(version(name)) >= Version(bound), name

@@ -22,7 +22,7 @@ from pyklip_diffrender.pyklip_backend import (
     register,
     unregister,
 )
-from pyklip_diffrender.pyklip_backend.child import spawned_beside_klip
+from pyklip_diffrender.pyklip_backend.patch import spawned_beside_klip
 
 # pyKLIP 2.10 takes the mean of sections that are all NaN.
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")

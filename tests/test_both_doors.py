@@ -28,6 +28,7 @@ from pyklip_diffrender.scene import sequence
 from pyklip_diffrender.scene.jwst_files import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.simulation import model_for
+from pyklip_diffrender.surveys import execution, jobs
 from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = [
@@ -263,9 +264,15 @@ def test_every_door_begins_the_same_fit(door, aligned, light, tmp_path, calls, e
     assert_same_call(first, calls[-1])
 
 
-@pytest.mark.parametrize("door", [through_reduce, through_klip_dataset, through_spaceklip])
+@pytest.mark.parametrize(
+    "door", [through_reduce, through_klip_dataset, through_spaceklip, through_a_survey]
+)
 def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, calls, monkeypatch):
-    files = written(tmp_path, light, aligned=True)
+    files = written(tmp_path, light, aligned=door is not through_a_survey)
+    if door is through_a_survey:
+        # It also makes sure that files do not change between plan and job.
+        monkeypatch.setattr(jobs, "sha256", lambda path: str(path))
+        monkeypatch.setattr(execution, "sha256", lambda path: str(path))
     opened = Counter()
     open_path, open_fits, judge = Path.open, fits.open, sequence.judge_frames
 
@@ -286,7 +293,7 @@ def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, c
     monkeypatch.setattr(Path, "open", count_path)
     monkeypatch.setattr(fits, "open", count_open)
     monkeypatch.setattr(sequence, "judge_frames", count_judged)
-    with contextlib.suppress(Stopped, ExceptionGroup):
+    with contextlib.suppress(Stopped, ExceptionGroup, DiffrenderError):
         door(files, tmp_path)
     assert len(calls) == 1
     assert opened["judged"] == 1
@@ -306,36 +313,38 @@ def with_companion(path, folder):
     return copy
 
 
+OTHER_DOORS = (through_klip_dataset, through_spaceklip, through_a_survey)
+
+
 @pytest.mark.parametrize(
-    ("visits", "exposure", "door", "companion"),
+    ("visits", "exposure", "doors", "companion"),
     [
-        ("34", "03106", through_klip_dataset, False),
-        ("34", "03107", through_klip_dataset, False),
+        ("34", "03106", OTHER_DOORS[:1], False),
+        ("3", "03107", OTHER_DOORS[:1], False),
         *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (
-                ("12", "03106", through_klip_dataset, False),
-                ("12", "03107", through_klip_dataset, False),
-                ("56", "03107", through_klip_dataset, True),
-                ("56", "03106", through_spaceklip, True),
-                ("56", "03106", through_a_survey, True),
+            pytest.param(visits, exposure, OTHER_DOORS, companion, marks=pytest.mark.slow)
+            for exposure in ("03106", "03107")
+            for visits, companion in (
+                ("12", False), ("34", False), ("56", True), *((each, False) for each in "123456"),
             )
         ),
     ],
-)
-def test_real_pairs_are_the_same_in_every_door(
-    visits, exposure, door, companion, shared_data, tmp_path, calls, monkeypatch
+)  # fmt: skip
+def test_real_rolls_are_the_same_in_every_door(
+    visits, exposure, doors, companion, shared_data, tmp_path, calls, monkeypatch
 ):
     """The frames, the map and the pattern of the library, without a fit."""
     monkeypatch.setattr("pyklip_diffrender.pattern.choice.package_library", package_library)
     files = sorted((shared_data / "gto1184").glob(f"jw0118400[{visits}]001_{exposure}*"))
-    assert len(files) == 2
+    assert len(files) == len(visits)
     if companion:
         files = [with_companion(each, tmp_path) for each in files]
-    for each in (through_reduce, door):
+    for door in (through_reduce, *doors):
         with contextlib.suppress(Stopped, ExceptionGroup, DiffrenderError):
-            each(files, tmp_path)
-    assert_same_call(*calls)
+            door(files, tmp_path)
+    assert len(calls) == 1 + len(doors)
+    for call in calls[1:]:
+        assert_same_call(calls[0], call)
 
 
 def assert_same(one, other):

@@ -88,7 +88,7 @@ def test_means_take_at_most_one_and_a_half_times_their_file(tmp_path, monkeypatc
 def test_pyklip_datasets_take_about_twice_their_file(tmp_path, monkeypatch):
     """What pyKLIP holds itself included: its frames take a third of the file."""
     JWST = pytest.importorskip("pyklip.instruments.JWST")
-    from pyklip_diffrender.pyklip_backend import dataset_frames
+    from pyklip_diffrender.pyklip_backend import dataset_frames, source_frames
 
     def offline(**options):
         raise OSError("offline")
@@ -117,7 +117,7 @@ def test_pyklip_datasets_take_about_twice_their_file(tmp_path, monkeypatch):
             assert peak(gathered) < 2.5 * BYTES
     finally:
         dr.unregister()
-    source = getattr(datasets[-1], dataset_frames.ATTRIBUTE)
+    source = getattr(datasets[-1], source_frames.ATTRIBUTE)
     assert source.data.dtype == np.float32
     # A dataset keeps the means that a sequence has.
     (file,) = source.files.values()

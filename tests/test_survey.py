@@ -18,6 +18,7 @@ from survey_stubs import HOSTILE, configuration, inputs, result, stub
 from synthetic_searches import searched, write_searched
 
 import pyklip_diffrender as dr
+from benchmarks import faults
 from benchmarks.calints_files import CENTER, SIDE, calints
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
@@ -29,6 +30,7 @@ from pyklip_diffrender.surveys.jobs import jobs_of
 
 PLANETS = {"contrasts": [1e-5, 3e-6], "separations": [0.5, 1.0], "angles": [0, 90.0]}
 PLANET = {"contrasts": [1e-5], "separations": [0.5]}
+NO_STAR = np.zeros((SIDE, SIDE))
 
 
 @pytest.fixture(autouse=True)
@@ -169,8 +171,9 @@ def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path):
     chosen = [[each.name for each in epoch.science] for epoch in epochs]
     assert chosen == [["0.fits", "1.fits"], ["2.fits"]]
     assert jobs[3].epoch == jobs[2].epoch
-    # One epoch is named as before.
+    # One epoch is named as before, whatever else is in the folder.
     (frames / "2.fits").unlink()
+    calints(frames / "3.fits", observation=2, date="2023-12-01T06:00:00", light=NO_STAR)
     assert [each.name for each in planned(config)] == ["HD 1", "HD 1"]
 
 
@@ -540,3 +543,32 @@ def test_files_with_and_without_a_planet(tmp_path):
         products = {path.name for path in (tmp_path / "products" / "jobs" / name).iterdir()}
         assert {"detection.fits", "candidates.ecsv", "report.html"} <= products
         assert ("fit.fits" in products) == has_fit
+
+
+# Surveys as real processes that are killed, and inputs that are damaged.
+
+WITH_DASK = ("workers_killed", "client_killed")
+WITHOUT = ("full_disk", "damaged_inputs")
+BY_HAND = (
+    "out_of_memory", "two_surveys", "scheduler_killed", "blind_worker", "read_only", "file_limit",
+)  # fmt: skip
+"""Where importing the libraries alone needs more than the limit, the workers of the first are
+restarted without end. The others take long, and break the same code as those that remain."""
+
+
+@pytest.mark.slow
+@pytest.mark.hard
+@pytest.mark.parametrize(
+    "scenario",
+    [*WITH_DASK, *WITHOUT, *(pytest.param(name, marks=pytest.mark.study) for name in BY_HAND)],
+)
+def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, monkeypatch):
+    if scenario in (*WITH_DASK, *BY_HAND[:4]):
+        pytest.importorskip("distributed")
+    # Of the surveys, which are processes.
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[1]))
+    try:
+        said = getattr(faults, scenario)(tmp_path, 1, 60)
+    except PermissionError as error:
+        pytest.skip(f"{scenario}: {error}")
+    assert said

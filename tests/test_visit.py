@@ -18,7 +18,7 @@ from pyklip_diffrender.reduction import ReduceOptions, Visit, pipeline
 from pyklip_diffrender.reduction import visit as visits
 from pyklip_diffrender.reduction.visit import with_references
 from pyklip_diffrender.refinement import GaussNewton, align_frame, join_frames, refine
-from pyklip_diffrender.refinement.solver import exposure_sequences
+from pyklip_diffrender.refinement.settings import exposure_sequences
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 

@@ -39,9 +39,7 @@ from pyklip_diffrender.pyklip_backend.backend_settings import (
     thread_limit,
 )
 from pyklip_diffrender.pyklip_backend.dataset_frames import (
-    ATTRIBUTE,
     Frames,
-    attach_source,
     date_of_frames,
     frames_of,
     library_files,
@@ -65,6 +63,7 @@ from pyklip_diffrender.pyklip_backend.output_files import (
     throughput_map,
     write_throughput,
 )
+from pyklip_diffrender.pyklip_backend.source_frames import ATTRIBUTE, attach_source
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.wavefront.opd import OPDMap
 

@@ -19,8 +19,6 @@ from pyklip_diffrender.pyklip_backend.backend_settings import (
     OPDLike,
     settings_of,
 )
-from pyklip_diffrender.pyklip_backend.child import announce, spawned_beside_klip
-from pyklip_diffrender.pyklip_backend.dataset_frames import keeping_references, keeping_source
 from pyklip_diffrender.pyklip_backend.klip_call import (
     RESULTS,
     DatasetReduction,
@@ -28,7 +26,13 @@ from pyklip_diffrender.pyklip_backend.klip_call import (
     mark_filtered,
 )
 from pyklip_diffrender.pyklip_backend.output_files import ReductionRecord
-from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
+from pyklip_diffrender.pyklip_backend.patch import (
+    PatchedFunction,
+    PatchedMethod,
+    announce,
+    spawned_beside_klip,
+)
+from pyklip_diffrender.pyklip_backend.source_frames import keeping_references, keeping_source
 
 __all__ = [
     "ALGORITHM",

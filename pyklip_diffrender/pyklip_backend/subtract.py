@@ -13,8 +13,13 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import heard_by
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.dataset_frames import Pointing, pointings_of
-from pyklip_diffrender.pyklip_backend.fitted_star import Fit, FittedPointing, Subtraction, counted
+from pyklip_diffrender.pyklip_backend.fitted_star import (
+    Fit,
+    FittedPointing,
+    Subtraction,
+    counted,
+)
+from pyklip_diffrender.pyklip_backend.source_frames import Pointing, pointings_of
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
 from pyklip_diffrender.scene.simulation import model_for

@@ -32,8 +32,8 @@ from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.model import LinearModel, Unknown
 from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, Status, pixel_grid
 from pyklip_diffrender.refinement.forward import Objective, Problem, State
-from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.solver import ModePriors, Solver, StepState, count_modes_below
+from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors, count_modes_below
+from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.star_place import local_maxima
 from pyklip_diffrender.wavefront.bases import Basis

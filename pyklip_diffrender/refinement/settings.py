@@ -1,30 +1,35 @@
-"""Settings of the refinement methods, and presets for real frames."""
+"""Settings of the refinement methods, presets for real frames, and the priors that both imply."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import stop_is_measured
 from pyklip_diffrender.instrument.spectrum import filter_throughput
-from pyklip_diffrender.io.units import ARCSEC, require_positive, to_bytes, to_unit
+from pyklip_diffrender.io.units import ARCSEC, half_circle, require_positive, to_bytes, to_unit
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, samples_for_field
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.exposure import image_mask, module_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import Basis
-from pyklip_diffrender.wavefront.priors import WavefrontPrior
+from pyklip_diffrender.wavefront.priors import EvidenceUpdate, WavefrontPrior, scale_ratios
 
 __all__ = [
     "GaussNewton",
+    "ModePriors",
     "coarse_arguments",
+    "count_modes_below",
+    "exposure_sequences",
     "faintness",
     "nircam_settings",
     "quick_settings",
@@ -505,3 +510,129 @@ def _cycles_to_edge(wavelength: float, reach: int) -> float:
     """Spatial frequency that moves light by `reach` pixels of NIRCam, if it is not too high."""
     pixel = 0.063 if wavelength > _LONG_WAVE else 0.031
     return float(min(_MOST_CYCLES, int(reach * pixel * ARCSEC * JWST_DIAMETER / wavelength)))
+
+
+# Priors of the modes of a fit: amplitude, wavefront, and its drift between frames.
+
+_IMPROBABLE = 1.5
+"""Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
+
+
+_SAME_SEQUENCE = 2.0 / 24
+"""Days between the beginnings of frames of one exposure sequence: nine dithers of a faint star."""
+
+_SAME_ROLL = 1.0
+"""Degrees by which the roll may differ within an exposure sequence."""
+
+
+def exposure_sequences(observations: Sequence[Observation]) -> list[int]:
+    """Number the exposure sequence of every observation, from 0 in the order of first appearance.
+
+    Frames of one star at one roll, each begun at most two hours after another one, are of one
+    sequence, such as small-grid dithers. Frames of which date or angle are not known belong to
+    every sequence of their star.
+    """
+    numbers: list[int] = []
+    for k, each in enumerate(observations):
+        own = [numbers[j] for j in range(k) if _follows(each, observations[j])]
+        numbers.append(own[0] if own else 1 + max(numbers, default=-1))
+    return numbers
+
+
+def _follows(one: Observation, other: Observation) -> bool:
+    """Whether there is no slew between two observations, as far as is known."""
+    if one.target != other.target or one.reference != other.reference:
+        return False
+    dates = [each.date.mjd for each in (one, other) if each.date is not None]
+    if max(dates, default=0.0) - min(dates, default=0.0) > _SAME_SEQUENCE:
+        return False
+    angle, other_angle = one.position_angles, other.position_angles
+    if angle is None or other_angle is None:
+        return True
+    return abs(half_circle(float(angle[0] - other_angle[0]))) <= _SAME_ROLL
+
+
+def count_modes_below(basis: Basis, cycles: float) -> int:
+    """Count the leading modes of a basis whose spatial frequency is at most `cycles`."""
+    beyond = torch.nonzero(basis.frequencies > cycles).flatten()
+    return int(beyond[0]) if len(beyond) else len(basis)
+
+
+@dataclass(frozen=True)
+class ModePriors:
+    """Gaussian priors about zero on the modes: amplitude, wavefront and blocks of drift."""
+
+    amplitude: Tensor  # (amplitude modes,), standard deviations, nm of an imaginary OPD.
+    drift: int  # Number of leading modes of the wavefront that may differ between frames.
+    # For every frame, the blocks of drift that its wavefront has: first that of its exposure
+    # sequence or, where frames of a sequence share none, its own.
+    blocks: tuple[tuple[int, ...], ...]
+    # (modes + blocks * drift,), standard deviations relative to the scale of the group.
+    shape: Tensor
+    group: Tensor  # (modes + blocks * drift,), int64, index of the group in `names`.
+    names: tuple[str, ...]
+    scales: Tensor  # (groups,), nm; a step of a fit returns others unless they are fixed.
+
+    @classmethod
+    def of(
+        cls, settings: GaussNewton, basis: Basis, observations: Sequence[Observation]
+    ) -> ModePriors:
+        """Return the priors of a fit to frames of these observations."""
+        prior, drift, dither = settings.prior, settings.drift, settings.dither_drift
+        shape, group, names = [prior.shape(basis)], [basis.group_index], list(basis.groups)
+        scales = [prior.scales[name] for name in basis.groups]
+        drifting, blocks = 0, []
+        if drift is not None and len(observations) > 1:
+            drifting = count_modes_below(basis, settings.drift_cycles)
+            sequences = list(range(len(observations)))
+            if dither is not None:
+                sequences = exposure_sequences(observations)
+            blocks = [[number] for number in sequences]
+            # A frame's wavefront is the shared one, plus the block of its exposure sequence
+            # (`drift`), plus a block of its own (`dither`) where the sequence has other frames.
+            # Blocks are numbered in this order, and each repeats the leading modes of the shared
+            # wavefront.
+            kinds = [(drift, "drift", 1 + max(sequences))]
+            if dither is not None:
+                many = [k for k, each in enumerate(sequences) if sequences.count(each) > 1]
+                for number, k in enumerate(many, 1 + max(sequences)):
+                    blocks[k].append(number)
+                kinds += [(dither, "dither", len(many))] if many else []
+            for kind, label, count in kinds:
+                shape.append(kind.shape(basis)[:drifting].repeat(count))
+                group.append((basis.group_index[:drifting] + len(names)).repeat(count))
+                names += [f"{name} {label}" for name in basis.groups]
+                scales += [kind.scales[name] for name in basis.groups]
+        return cls(
+            prior.amplitude_deviation(basis),
+            drifting,
+            tuple(map(tuple, blocks)),
+            torch.cat(shape),
+            torch.cat(group),
+            tuple(names),
+            torch.tensor(scales, dtype=torch.float64),
+        )
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviations of amplitude, wavefront and drift, in this order."""
+        return torch.cat([self.amplitude, self.scales[self.group] * self.shape])
+
+    def ratios_if_fixed(self, update: EvidenceUpdate, settings: GaussNewton) -> dict[str, float]:
+        """Size of the fitted modes relative to their priors, by group; empty if they are fitted."""
+        is_fixed = settings.wavefront and not settings.prior.fit_scales
+        return self.ratios(update) if is_fixed else {}
+
+    def are_improbable(self, ratios: Mapping[str, float]) -> bool:
+        """Whether the wavefront is too large for its prior."""
+        of_wavefront = [ratios[name] for name in self.names if ratios]
+        return max(of_wavefront, default=0.0) >= _IMPROBABLE
+
+    def ratios(self, update: EvidenceUpdate) -> dict[str, float]:
+        """Size of the fitted modes relative to their priors, by group, from all unknowns."""
+        assert update.variance is not None
+        amplitude = torch.zeros(len(self.amplitude), dtype=torch.int64)
+        group = torch.cat([amplitude, self.group + 1])
+        last = slice(-len(group), None)
+        ratios = scale_ratios(update.step[last], update.variance[last], self.deviation, group)
+        return dict(zip(["amplitude", *self.names], ratios.tolist(), strict=True))

@@ -22,7 +22,12 @@ from pyklip_diffrender.linear.model import FrameRows, Unknown
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["COMPANION_PRIOR", "FrameUnknowns", "Unknowns", "brightest"]
+__all__ = [
+    "COMPANION_PRIOR",
+    "FrameUnknowns",
+    "Unknowns",
+    "brightest",
+]
 
 _LINEAR = tuple(p.name for p in LEVELS)
 

@@ -87,7 +87,9 @@ class FrameFile:
     observation: Observation | None = field(default=None, repr=False)
 
     @classmethod
-    def in_hdus(cls, hdus: fits.HDUList, path: Path, *, frames: bool) -> FrameFile:
+    def in_hdus(
+        cls, hdus: fits.HDUList, path: Path, *, frames: bool | Callable[[Exposure], bool]
+    ) -> FrameFile:
         """Read the header of an open file, and the means of its frames if they are asked for."""
         product = _why_a_product(hdus)
         if product:
@@ -99,7 +101,7 @@ class FrameFile:
             file = cls(path, Exposure.of(header, path.name, shape))
         except DiffrenderError as error:
             file = cls(path, Exposure(path.name), reason=_without_name(error, path.name))
-        if frames:
+        if frames if isinstance(frames, bool) else not file.reason and frames(file.exposure):
             try:
                 file.frames = Observation.means_from_hdus(hdus, path)
             except DiffrenderError as error:
@@ -107,7 +109,7 @@ class FrameFile:
         return file
 
     @classmethod
-    def opened(cls, path: Path, *, frames: bool) -> FrameFile:
+    def opened(cls, path: Path, *, frames: bool | Callable[[Exposure], bool]) -> FrameFile:
         """Open a file once; read its header, and the means of its frames if they are asked for."""
         try:
             with open_fits(path, images=False) as hdus:
@@ -145,11 +147,13 @@ def _without_name(error: Exception, name: str) -> str:
 def exposures_in(
     files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     references: Iterable[str | os.PathLike[str]] = (),
+    filter: str | None = None,
 ) -> list[FrameFile]:
     """Find FITS files, or those in folders, and read their headers; NoValidPixelsError for none.
 
     Files that are all marked as those of reference stars are of the target if there are
-    `references`.
+    `references`. Of files that can be used with a `filter`, the frames are read at once, so that no
+    file is opened twice.
     """
     entries = [files] if isinstance(files, str | os.PathLike) else list(files)
     paths: list[Path] = []
@@ -163,9 +167,14 @@ def exposures_in(
             paths.append(each)
     if not paths:
         raise NoValidPixelsError("files: got none, expected at least one")
-    listed = [FrameFile.opened(path, frames=False) for path in paths]
+
+    def is_wanted(exposure: Exposure) -> bool:
+        return same_name(exposure.filter, filter) and not _why_unusable(exposure)
+
+    frames = False if filter is None else is_wanted
+    listed = [FrameFile.opened(path, frames=frames) for path in paths]
     return with_references(
-        listed, [FrameFile.opened(Path(path), frames=False) for path in references]
+        listed, [FrameFile.opened(Path(path), frames=frames) for path in references]
     )
 
 

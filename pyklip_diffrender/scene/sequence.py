@@ -45,7 +45,7 @@ from pyklip_diffrender.scene.pixel_checks import (
 )
 from pyklip_diffrender.scene.simulation import images_of_stars
 
-__all__ = ["SHORT", "Row", "Sequence", "judge_frames", "rows_table"]
+__all__ = ["SHORT", "Epoch", "Row", "Sequence", "epochs_of_files", "judge_frames", "rows_table"]
 
 
 # The table of admission: one row for each file, what it is used for, and what it is.
@@ -318,7 +318,7 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        return cls._by_epoch(_usable(files, references, star, target), target, filter)
+        return cls._by_epoch(_usable(files, references, star, target, filter), target, filter)
 
     @classmethod
     def by_filter_and_epoch(
@@ -342,7 +342,7 @@ class Sequence:
         # Stars are told apart on copies of the files, because the reasons that this fills in hold
         # for one filter alone. Where there are several filters, frames are judged first, so that
         # none is there only by frames that are excluded.
-        listed = _usable(files, references, star, target)
+        listed = _usable(files, references, star, target, filter)
         if filter is not None:
             return cls._by_epoch(listed, target, filter)
         science, _ = choose_target([replace(each) for each in listed], target, judge_frames)
@@ -500,14 +500,56 @@ class Sequence:
         return replace(self, science=science, references=references)
 
 
+# What is to be reduced, by the headers of files.
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """Frames of one target and filter that share a wavefront, before their pixels are judged."""
+
+    target: str
+    filter: str
+    date: Time | None  # mean of the target's frames
+
+
+def epochs_of_files(
+    files: Iterable[str | os.PathLike[str]],
+    *,
+    target: str | None = None,
+    filter: str | None = None,
+) -> tuple[Epoch, ...]:
+    """List the epochs that `Sequence.by_epoch` sorts files into, in order of time.
+
+    Pixels are judged only where the headers leave open which file, filter or target is meant, or
+    have several epochs. Raises as `Sequence.from_files`.
+    """
+    listed = _usable(files, ())
+    filter = choose_filter(listed, filter, judge_frames)
+    science, _ = choose_target(listed, target, judge_frames)
+    star = science[0].star
+    if len(epochs_of([each.exposure.date for each in science])) > 1:
+        judge_frames(science)
+        science = admissible(science)
+    dates = [each.exposure.date for each in science]
+    epochs = []
+    for group in epochs_of(dates):
+        known = [date for date in (dates[k] for k in group) if date is not None]
+        epochs.append(Epoch(star, filter, Time(known).mean() if known else None))
+    return tuple(epochs)
+
+
 def _usable(
     files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     references: Iterable[str | os.PathLike[str]],
     star: tuple[float, float] | None = None,
     target: str | None = None,
+    filter: str | None = None,
 ) -> list[FrameFile]:
-    """Files with the reasons of those that cannot be used, of which some are left."""
-    listed = exposures_in(files, references)
+    """Files with the reasons of those that cannot be used, of which some are left.
+
+    With a `filter`, its frames are read at once, unless the place of their star is still to come.
+    """
+    listed = exposures_in(files, references, filter if star is None else None)
     if star is not None:
         place = _star_place(star)
         marked = all(each.exposure.reference for each in listed if not each.reason)

@@ -25,8 +25,8 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.headers import file_name
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
-from pyklip_diffrender.pyklip_backend.dataset_frames import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
+from pyklip_diffrender.pyklip_backend.source_frames import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.reduction import SPECTRA, by_star, in_words, search_together
 from pyklip_diffrender.refinement import to_jansky
 from pyklip_diffrender.scene.admission import FrameFile

@@ -20,7 +20,7 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import fits_files, read_text, sha256
 from pyklip_diffrender.io.headers import file_name
-from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.sequence import epochs_of_files
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
 from pyklip_diffrender.wavefront.opd import wavefront_for
 from pyklip_diffrender.wavefront.opd_map import FLAT
@@ -140,8 +140,9 @@ def _jobs(sequence: SequenceConfig, digest: Callable[[Path], str]) -> list[Job]:
     files = _files(sequence.files)
     planets = sequence.injections
     jobs = []
-    for opd, epoch, name in _epochs(sequence, files):
+    for opd, epoch, name, filter in _epochs(sequence, files):
         plain = _job(replace(sequence, name=name), files, opd, epoch, digest)
+        plain = replace(plain, filter=filter)
         injected = [
             _with_planet(plain, Injection(contrast, separation, angle))
             for contrast in planets.contrasts
@@ -152,22 +153,25 @@ def _jobs(sequence: SequenceConfig, digest: Callable[[Path], str]) -> list[Job]:
     return jobs
 
 
-def _epochs(sequence: SequenceConfig, files: list[Path]) -> list[tuple[Path, str | None, str]]:
-    """Wavefront map, date and name of every epoch; without a date if there is just one."""
+def _epochs(
+    sequence: SequenceConfig, files: list[Path]
+) -> list[tuple[Path, str | None, str, str | None]]:
+    """Wavefront map, date, name and filter of every epoch; without a date if there is just one."""
     of_folder = str(sequence.opd) != FLAT and sequence.opd.is_dir()
     try:
-        epochs = Sequence.by_epoch(files, target=sequence.target, filter=sequence.filter)
+        epochs = epochs_of_files(files, target=sequence.target, filter=sequence.filter)
     except DiffrenderError:
         if of_folder:
             raise
-        return [(sequence.opd, None, sequence.name)]  # The job will fail, and its row says why.
+        return [(sequence.opd, None, sequence.name, sequence.filter)]  # The job will fail, and its row says why.
     opd = sequence.opd
     return [
         (
             # As `reduce` chooses it: the one nearest to the target's frames.
             opd / wavefront_for(opd, each.date).name if of_folder else opd,
             each.date.isot if len(epochs) > 1 and each.date is not None else None,
-            sequence.name if sequence.is_named else f"{each.target} {each.filter or ''}".rstrip(),
+            sequence.name if sequence.is_named else f"{each.target} {each.filter}",
+            each.filter,
         )
         for each in epochs
     ]
