@@ -11,7 +11,6 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-import pytest
 import torch
 from astropy.io import fits
 from astropy.table import Table
@@ -173,14 +172,6 @@ def nircam(folder, image_mask="MASK335R", pupil_mask="MASKRND", band="F444W", np
     instrument.pupil = str(folder / f"jwst_pupil_{pupil}_npix{npix}.fits.gz")
     instrument.options.update(options)
     return instrument
-
-
-def official_files(shared_data):
-    """The folder of STScI's own files."""
-    folder = shared_data / "stpsf-data"
-    if not folder.is_dir():
-        pytest.skip(f"needs STScI's files for stpsf in {folder}")
-    return folder
 
 
 def zernike_tensor(seed):

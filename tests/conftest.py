@@ -117,6 +117,15 @@ def shared_data():
 
 
 @pytest.fixture(scope="session")
+def official_files(shared_data):
+    """The folder of STScI's own files for stpsf."""
+    folder = shared_data / "stpsf-data"
+    if not folder.is_dir():
+        pytest.skip(f"needs STScI's files for stpsf in {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def stpsf_path(tmp_path_factory):
     """An offline data directory with 256 samples across the pupil, set as STPSF_PATH."""
     if importlib.util.find_spec("stpsf") is None:

@@ -7,7 +7,6 @@ import pytest
 import torch
 from astropy.io import fits
 
-from benchmarks.stpsf_data import official_files
 from pyklip_diffrender.instrument import jwst_pupil, maskrnd_openings
 from pyklip_diffrender.optics import (
     JWST_DIAMETER,
@@ -90,9 +89,9 @@ def test_obscurations_in_flight_are_only_about_the_struts():
         ("flight", "jwst_pupil_flight_npix1024.fits.gz", 5e-4),
     ],
 )
-def test_outlines_are_those_of_the_official_maps(shared_data, shape, file, limit):
+def test_outlines_are_those_of_the_official_maps(official_files, shape, file, limit):
     """To what a contour of a sampled map can know; behind them images agree to 0.2 %."""
-    truth = torch.from_numpy(fits.getdata(official_files(shared_data) / file).astype(np.float64))
+    truth = torch.from_numpy(fits.getdata(official_files / file).astype(np.float64))
     truth = truth / truth.max()
     stop = polygon_coverage(maskrnd_openings(), PupilGrid.full(1024))
     mine = stop if shape == "stop" else jwst_pupil(1024, pupil=shape)

@@ -10,7 +10,6 @@ import torch
 from astropy.io import fits
 from astropy.table import Table
 
-from benchmarks.stpsf_data import official_files
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import (
     FILTERS,
@@ -143,14 +142,9 @@ def test_crosstalk_couples_pixels_after_everything_else(values, oversample, opd)
     assert np.abs(plain - truth).max() > 5e-3 * truth.max()
 
 
-@pytest.fixture(scope="module")
-def official(shared_data):
-    return official_files(shared_data)
-
-
 @pytest.mark.parametrize("name", FILTERS)
-def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official, name):
-    data = fits.getdata(official / "NIRCam" / "filters" / f"{name}_throughput.fits")
+def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official_files, name):
+    data = fits.getdata(official_files / "NIRCam" / "filters" / f"{name}_throughput.fits")
     truth = data["THROUGHPUT"] / data["THROUGHPUT"].max()
     wavelength, throughput = filter_throughput(name)
     # The ends are where the table, in units of 0.1 Angstrom, has been rounded.
@@ -162,8 +156,8 @@ def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official
 
 
 @pytest.mark.parametrize("module", ["A", "B"])
-def test_aberrations_are_those_of_the_official_field_points(official, module):
-    table = Table.read(official / "si_zernikes_coron_wfe.fits")
+def test_aberrations_are_those_of_the_official_field_points(official_files, module):
+    table = Table.read(official_files / "si_zernikes_coron_wfe.fits")
     places = [(r["instrument"].strip(), r["field_point_name"].strip()) for r in table]
     for short_wave, mask in itertools.product((True, False), MASKS):
         channel = f"NIRCam{'SW' if short_wave else 'LW'}{module}"

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchmarks.parity_cases import BARE, CALL, EMBEDDED, FULL, MIDDLE, differences
-from benchmarks.stpsf_data import lyot_stop, nircam, official_files
+from benchmarks.stpsf_data import lyot_stop, nircam
 from pyklip_diffrender.bridges import from_webbpsf
 from pyklip_diffrender.instrument import (
     MASKS,
@@ -99,11 +99,10 @@ def test_the_stop_moves_and_turns_as_in_stpsf(stpsf_path):
 
 
 @pytest.fixture
-def official(shared_data, monkeypatch):
+def official(official_files, monkeypatch):
     """STScI's files, as STPSF_PATH."""
-    folder = official_files(shared_data)
-    monkeypatch.setenv("STPSF_PATH", str(folder))
-    return folder
+    monkeypatch.setenv("STPSF_PATH", str(official_files))
+    return official_files
 
 
 # Every mask in both channels: stpsf's apertures by filter.
