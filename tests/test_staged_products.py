@@ -143,14 +143,15 @@ def test_a_detection_in_terms_of_astropy(stopped):
         blind.coordinates  # noqa: B018
 
 
-def test_a_quick_reduction_is_coarser_where_the_star_is_fainter():
+def test_a_quick_reduction_is_smaller_and_coarser_where_the_star_is_fainter():
+    given = ({}, {"accuracy": "quick"}, {"accuracy": "quick", "size": 80})
+    assert [ReduceOptions(**each).side for each in given] == [80, 56, 80]
     ones = np.ones((1, 80, 80))
     header = fits.Header({"INSTRUME": "NIRCAM", "CORONMSK": "MASKA335R"})
 
     def frame(snr):
-        return dr.Observation.from_arrays(
-            snr * ones, ones, pixelscale=0.063, filter="F444W", header=header
-        )
+        facts = {"pixelscale": 0.063, "filter": "F444W", "header": header}
+        return dr.Observation.from_arrays(snr * ones, ones, **facts)
 
     bright, fainter, faint = (frame(np.sqrt(1800 / k)) for k in (1, 10, 200))
     assert [round(faintness(each)) for each in (bright, fainter, faint)] == [1, 10, 200]
@@ -158,7 +159,6 @@ def test_a_quick_reduction_is_coarser_where_the_star_is_fainter():
     assert settings_for(bright).cycles[0] > cycles[0] > cycles[1] > cycles[2]
     assert coarse_arguments(bright, 80) == {"nlambda": 5, "npix": 128}
     assert coarse_arguments(faint, 80)["nlambda"] == 3
-    # A wide field would repeat with so few samples.
     assert coarse_arguments(bright, 320)["npix"] == 256
     for wrong in ({"accuracy": "fast"}, {"accuracy": "quick", "settings": dr.GaussNewton()}):
         with pytest.raises(IncompatibleSetupError, match="accuracy"):

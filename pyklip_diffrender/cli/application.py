@@ -389,7 +389,10 @@ Examples:
 )
 @archive
 @wavefront
-@declared("size", section="Fit")
+@declared(
+    "size", section="Fit", default=80, show_default=True,
+    help="Side of the fitted square about the star, pixels.",
+)  # fmt: skip
 @outputs(file="FITS file for the library; finished fits are kept in a folder beside it.")
 @click.pass_obj
 def learn(

@@ -96,7 +96,7 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
     """The stages of a reduction of a cut sequence, each with its duration on two cores, s."""
     count = len(sequence.science)
     systematics = options.systematics
-    area = (options.size / 80) ** 2
+    area = (options.side / 80) ** 2
     # The time of a fit grows with the powers `_PIXELS` of the pixels and `_FRAMES` of the frames.
     fit = _FIT * area**_PIXELS * (_QUICK if options.accuracy == "quick" else 1.0)
     steps = []
@@ -154,7 +154,7 @@ def describe_plan(sequence: Sequence, options: ReduceOptions) -> str:
     total = sum(seconds for _, seconds in steps)
     joins = options.references == "joint" and not options.disk
     frames = len(sequence.science) + joins * len(sequence.references)
-    memory = _MEMORY + _MEMORY_PER_FRAME * frames * (options.size / 80) ** 2
+    memory = _MEMORY + _MEMORY_PER_FRAME * frames * (options.side / 80) ** 2
     files = [row.path for row in sequence.rows if row.path is not None and row.path.exists()]
     largest = max((path.stat().st_size for path in files), default=0)
     # A reduction reads before it fits, and what it has read is then the means of integrations.

@@ -371,14 +371,14 @@ def prepare(
             "give the flux as star_flux (--star-flux)"
         )
     if options.wide:
-        require_outer_pixels(sequence.science[0], options.size)
+        require_outer_pixels(sequence.science[0], options.side)
     first, settings, coarser = sequence.science[0], options.settings, {}
     if options.accuracy == "quick":
-        settings = quick_settings(first.cutout(options.size))
-        coarser = coarse_arguments(first, max(first.shape) if options.wide else options.size)
+        settings = quick_settings(first.cutout(options.side))
+        coarser = coarse_arguments(first, max(first.shape) if options.wide else options.side)
     if model is None:
-        model = model_for(first, options.size, device=options.device, **coarser)
-        cut = sequence.cutout(options.size)
+        model = model_for(first, options.side, device=options.device, **coarser)
+        cut = sequence.cutout(options.side)
     else:
         cut = sequence.cutout(model.detector.shape, beyond_edges=True)
     if reference is not None:

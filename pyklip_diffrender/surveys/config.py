@@ -378,7 +378,7 @@ def _sequence(
     name = table.take("name", label, "printable text", as_text)
     own = _options(table, options)
     planets = _injections(table.table("injections"), injections)
-    edge = own.size * _PIXEL / 2
+    edge = own.side * _PIXEL / 2
     for each in planets.separations:
         if each >= edge:
             table.complain("separations", each, f"less than {edge:.2g} arcsec, half of the field")

@@ -67,7 +67,7 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         ]
         references = tuple(each.observation for each in fit.frames if each.observation.reference)
         if job.options.disk:
-            frames = _with_disk(frames, _sequence(job).cutout(job.options.size).science)
+            frames = _with_disk(frames, _sequence(job).cutout(job.options.side).science)
         science = with_planets(frames, [planet])
         sequence = Sequence(first.target, science, references)
         changes |= {"systematics": fit.systematics or "off", "wide": False}
