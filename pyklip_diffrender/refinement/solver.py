@@ -165,8 +165,8 @@ def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Ten
         white = jacobian[:, piece].double().mul_(weight[piece])
         gradient += white @ residual[piece]
         triangle = dsyrk(1.0, white.numpy().T, beta=1.0, c=triangle, trans=1, overwrite_c=1)
-    upper = torch.from_numpy(triangle)
-    return upper + upper.triu(1).T, gradient
+    product = torch.from_numpy(triangle)
+    return product.add_(product.triu(1).T), gradient
 
 
 def linearise(
