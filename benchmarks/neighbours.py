@@ -136,6 +136,7 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
     error = detection.error * detection.error_factor.of(detection.grid)
     flux = reduction.fit.frames[0].flux
     ratio = (flux * error / base["error"])[far]
+    unscaled = (flux * detection.error / base["unscaled"])[far]
     photon = (flux * detection.photon_error / base["photon"])[far]
     found = false = 0
     wide = reduction.wide
@@ -160,6 +161,7 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
         "companions": len(reduction.fit.planets),
         "limits": float(np.nanmedian(ratio)), "limits_90": float(np.nanpercentile(ratio, 90)),
         "limits_10": float(np.nanpercentile(ratio, 10)), "scatter": float(scatter),
+        "unscaled_limits": float(np.nanmedian(unscaled)),
         "photon_limits": float(np.nanmedian(photon)),
         "photon_limits_90": float(np.nanpercentile(photon, 90)),
     }  # fmt: skip
@@ -189,6 +191,7 @@ def main() -> None:
         "first": [each.first_pixel for each in sequence.science],
         "flux": frames[0].flux,
         "error": frames[0].flux * detection.error * detection.error_factor.of(detection.grid),
+        "unscaled": frames[0].flux * detection.error,
         "photon": frames[0].flux * detection.photon_error,
         "light": {each: light_of(untouched, around, 1.0, each) for each in {r for _, r in cases}},
         "wide": options.wide,

@@ -547,23 +547,23 @@ def test_files_with_and_without_a_planet(tmp_path):
 
 # Surveys as real processes that are killed, and inputs that are damaged.
 
-WITH_DASK = ("workers_killed", "client_killed")
-WITHOUT = ("full_disk", "damaged_inputs")
+SCENARIOS = ("workers_killed", "full_disk", "damaged_inputs")
 BY_HAND = (
-    "out_of_memory", "two_surveys", "scheduler_killed", "blind_worker", "read_only", "file_limit",
+    "client_killed", "out_of_memory", "two_surveys", "scheduler_killed", "blind_worker",
+    "read_only", "file_limit",
 )  # fmt: skip
-"""Where importing the libraries alone needs more than the limit, the workers of the first are
-restarted without end. The others take long, and break the same code as those that remain."""
+"""Where importing the libraries alone needs more than the limit, the workers of "out_of_memory"
+are restarted without end. The others take long, and break the same code as those that remain."""
 
 
 @pytest.mark.slow
 @pytest.mark.hard
 @pytest.mark.parametrize(
     "scenario",
-    [*WITH_DASK, *WITHOUT, *(pytest.param(name, marks=pytest.mark.study) for name in BY_HAND)],
+    [*SCENARIOS, *(pytest.param(name, marks=pytest.mark.study) for name in BY_HAND)],
 )
 def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, monkeypatch):
-    if scenario in (*WITH_DASK, *BY_HAND[:4]):
+    if scenario in (*SCENARIOS[:1], *BY_HAND[:5]):
         pytest.importorskip("distributed")
     # Of the surveys, which are processes.
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[1]))

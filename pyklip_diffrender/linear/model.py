@@ -16,7 +16,7 @@ then stands for J C^-1 J^T, with the derivatives J that are not whitened.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -122,7 +122,8 @@ class LinearFrame(FrameRows):
 
 def pixel_pieces(pixels: int) -> list[slice]:
     """Parts of an image of which arrays with all unknowns are small."""
-    return [slice(start, start + _PIXELS) for start in range(0, pixels, _PIXELS)]
+    starts = range(0, pixels, _PIXELS)
+    return [slice(start, min(start + _PIXELS, pixels)) for start in starts]
 
 
 # The covariance of the noise of frames that are fitted together, and its inverse.
@@ -220,15 +221,19 @@ class Noise:
         return total - float((self._summed(by_frame) ** 2).sum()) if self.shares_pattern else total
 
 
-def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
-    """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
-    total = torch.zeros(unknowns, frames[0].weight.numel(), dtype=torch.float32)
-    for frame in frames:
-        scale = (torch.ones(()) * (frame.weight**2 * frame.common).float()).flatten()
-        for pixels in pixel_pieces(total.shape[1]):
+def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Iterator[Tensor]:
+    """W c summed over frames with the derivative by every unknown, float32.
+
+    By piece of the image, (unknowns, some pixels), because all of it takes as much memory as the
+    Jacobians of all frames.
+    """
+    scales = [(f.weight**2 * f.common).float().expand(f.weight.shape).flatten() for f in frames]
+    for pixels in pixel_pieces(frames[0].weight.numel()):
+        total = torch.zeros(unknowns, pixels.stop - pixels.start, dtype=torch.float32)
+        for frame, scale in zip(frames, scales, strict=True):
             on_rows = frame.jacobian.flatten(1)[:, pixels] * scale[pixels]
-            total[:, pixels] += frame.onto_unknowns(on_rows, unknowns)
-    return total
+            total += frame.onto_unknowns(on_rows, unknowns)
+        yield total
 
 
 # The linear model of a fit: the Jacobian of all unknowns and their posterior covariance.

@@ -465,7 +465,7 @@ def faintness(observation: Observation) -> float:
 
 def coarse_arguments(observation: Observation, size: int) -> dict[str, Any]:
     """Arguments of `model_for`, by the noise, for a first look at `size` x `size` pixels."""
-    nlambda = 3 if faintness(observation) >= _VERY_FAINT else 5
+    nlambda = 3 if faintness(observation) >= _VERY_FAINT else 7
     if observation.filter is None:
         return {}
     shortest = float(filter_throughput(observation.filter)[0][0])

@@ -151,6 +151,10 @@ class NormalEquations:
     has_weights: bool = True
 
 
+_BLOCK = 256
+"""Rows of a large matrix that are copied at a time."""
+
+
 def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """G G^T and G r of the whitened Jacobian G = jacobian * weight.
 
@@ -159,14 +163,24 @@ def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Ten
     """
     count = len(jacobian)
     gradient = torch.zeros(count, dtype=torch.float64)
-    # Only one triangle is computed, in place; LAPACK wants columns contiguous.
-    triangle = np.zeros((count, count), order="F")
+    # Only one triangle is computed, in place. BLAS wants columns contiguous, so that its upper
+    # triangle is the lower one of a tensor.
+    lower = np.zeros((count, count), order="F")
     for piece in pixel_pieces(jacobian.shape[1]):
         white = jacobian[:, piece].double().mul_(weight[piece])
         gradient += white @ residual[piece]
-        triangle = dsyrk(1.0, white.numpy().T, beta=1.0, c=triangle, trans=1, overwrite_c=1)
-    product = torch.from_numpy(triangle)
-    return product.add_(product.triu(1).T), gradient
+        lower = dsyrk(1.0, white.numpy().T, beta=1.0, c=lower, trans=1, overwrite_c=1)
+    return _mirror(torch.from_numpy(lower.T)), gradient
+
+
+def _mirror(matrix: Tensor) -> Tensor:
+    """Copy the lower triangle of a square matrix onto the upper one, in place, block by block."""
+    for start in range(0, len(matrix), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        corner = matrix[block, block]
+        corner.copy_(corner.tril() + corner.tril(-1).T)
+        matrix[block, start + _BLOCK :] = matrix[start + _BLOCK :, block].T
+    return matrix
 
 
 def linearise(
@@ -225,9 +239,10 @@ def linearise(
             for onto, selection in parts:
                 curvature[to[:, None], onto] += product[which, selection]
     if noise.shares_pattern:
-        rows = summed_rows(frames, size)
-        ones = torch.ones(rows.shape[1], dtype=torch.float64)
-        curvature -= _accumulate(rows, ones, ones)[0]
+        lower = curvature.numpy().T
+        for rows in summed_rows(frames, size):
+            lower = dsyrk(-1.0, rows.double().numpy().T, beta=1.0, c=lower, trans=1, overwrite_c=1)
+        curvature = _mirror(torch.from_numpy(lower.T))
     gradient = gradient + curvature @ current
     return NormalEquations(
         state, kappa, robust, curvature, gradient, current, tuple(frames),
