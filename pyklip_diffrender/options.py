@@ -314,12 +314,11 @@ class ReduceOptions(SharedOptions):
     accuracy: Accuracy = field(default="full", metadata={
         "choices": get_args(Accuracy), "stated_type": '"full" or "quick"',
         "meaning": """
-            "quick" is for a first look: the model has fewer wavelengths and pupil samples, the fit
-            fewer modes, all the fewer the fainter the star is compared with its noise, and fewer
-            pixels. Rolls of G 7-34 and HIP 17695 took 0.32 to 0.44 of the time of a full reduction,
-            with limits 0.95 to 1.17 times as high, out to 1.7 arcsec; with ``size=80`` as well, 0.5
-            to 0.7 of it. Not together with `settings`.""",
-        "help": "A first look with a coarser model near the star, in a third of the time.",
+            "quick" is for a first look: the model has fewer pupil samples, the fit fewer modes, all
+            the fewer the fainter the star is compared with its noise, and fewer pixels. Rolls of G
+            7-34 and HIP 17695 took 0.37 to 0.53 of the time of a full reduction, with limits 0.87
+            to 1.13 times as high, out to 1.7 arcsec. Not together with `settings`.""",
+        "help": "A first look with a coarser model near the star, in half of the time or less.",
         "flag": "--quick", "not_in_surveys": "they are no first look",
     })  # fmt: skip
     device: str = field(default="cpu", metadata={
