@@ -163,9 +163,8 @@ def _epochs(
     except DiffrenderError:
         if of_folder:
             raise
-        return [
-            (sequence.opd, None, sequence.name, sequence.filter)
-        ]  # The job will fail, and its row says why.
+        # The job will fail, and its row says why.
+        return [(sequence.opd, None, sequence.name, sequence.filter)]
     opd = sequence.opd
     return [
         (
