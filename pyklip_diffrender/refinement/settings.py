@@ -316,16 +316,19 @@ class GaussNewton:
             As for `with_wider_priors`; those of `prior` do not count.
         within : GaussNewton
             Its drifts are the middle of the bounds, a factor of `_DRIFT_RANGE` to either side.
+            Dithers may differ by as much as exposures with a slew between them.
         """
         changed = {}
+        slews = within.drift
         for field_name, label in (("drift", _DRIFTS[0]), ("dither_drift", _DRIFTS[1])):
             prior, middle = getattr(self, field_name), getattr(within, field_name)
             if prior is not None and middle.fit_scales:
                 own = _labelled(ratios, label)
+                largest = middle.scales if slews is None else slews.scales
                 scales = {
                     name: float(np.clip(own.get(name, 1.0) * scale,
                                         middle.scales[name] / _DRIFT_RANGE,
-                                        middle.scales[name] * _DRIFT_RANGE))
+                                        max(largest[name], middle.scales[name]) * _DRIFT_RANGE))
                     for name, scale in prior.scales.items()
                 }  # fmt: skip
                 changed[field_name] = replace(prior, scales=scales)
