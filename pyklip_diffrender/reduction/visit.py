@@ -48,11 +48,12 @@ _DITHERS = WavefrontPrior(scales={"segment": 0.4, "texture": 0.25}, knee=1.0, sl
 _SLEW_RMS = 2.7
 _CYCLES = 8.0
 """Drift of the wavefront, nm, between exposures with a slew between them and between the dithers of
-one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show it, from
-a fourth of that up to 11 nm. The heaters of the instruments' electronics alone change it by 1 to 2 nm within minutes (R.
-Telfer et al. 2024, SPIE 13092), and it drifts by 9 nm within days (Feng et al. 2025, section 4).
-Finer modes than those up to 8 cycles per pupil are those of the polished segments, which last; with
-12 cycles, limits of a simulated visit are the same within 1 %, and take a quarter longer."""
+one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show it, from a fourth
+of that up to 11 nm. The heaters of the instruments' electronics alone change it by 1 to 2 nm within
+minutes (R. Telfer et al. 2024, SPIE 13092), and it drifts by 9 nm within days (Feng et al. 2025,
+section 4). Finer modes than those up to 8 cycles per pupil are those of the polished segments,
+which last; with 12 cycles, limits of a simulated visit are the same within 1 %, and take a quarter
+longer."""
 
 _TOLERANCE = 3e-4
 """`GaussNewton.tolerance` of the joint fit: 13 units of chi-squared for seven frames."""
