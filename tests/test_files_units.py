@@ -215,9 +215,6 @@ def test_a_process_killed_while_writing_leaves_the_old_product_intact(tmp_path, 
     assert sha256(path) == before
 
 
-# The package's own FITS keywords have one declaration, and products one form of each.
-
-
 def test_every_keyword_that_is_written_is_declared():
     """By texts of the package's modules that look like keywords of its own."""
     modules = (ROOT / "pyklip_diffrender").rglob("*.py")
