@@ -36,6 +36,7 @@ from astropy.table import Table
 
 import pyklip_diffrender as dr
 from benchmarks import stpsf_sequences as made
+from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.instrument import detector_place
 from pyklip_diffrender.optics import resample
 from pyklip_diffrender.parameters import parameter
@@ -210,7 +211,7 @@ def _run(visit: Visit, folder: Path) -> dict[str, Any]:
     torch.set_num_threads(1)
     try:
         return reduced(visit, folder)
-    except dr.DiffrenderError as error:
+    except DiffrenderError as error:
         return {"visit": visit.number, "status": f"{type(error).__name__}: {error}"}
 
 
