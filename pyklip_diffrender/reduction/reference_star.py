@@ -1,4 +1,4 @@
-"""What the fit of a star says of the telescope and the detector, as a file for other stars.
+"""Reference stars fitted once: wavefront and detector from the fit of a star, for other stars.
 
 A reference star that was fitted once serves all its targets. Its wavefront is a better place to
 start from than a map of another day: the telescope has changed by a few nanometres in hours, so
@@ -48,7 +48,7 @@ _NEW = 14.0
 
 @dataclass(frozen=True, eq=False)
 class ReferenceStar:
-    """What the fit of a star says of the telescope and the detector, for other stars.
+    """Wavefront and flat-field pattern from the fit of a star, for the fits of other stars.
 
     Give it, or the file that `write` makes, in place of the wavefront map: `reduce` then starts
     from the wavefront of this star, with a prior for what changes in the hours between two stars,

@@ -470,7 +470,7 @@ def combined_rows(combined: Mapping[str, Any]) -> tuple[list[str], list[list[str
 
 
 def in_words(combination: Combination | str) -> str:
-    """What a search over filters and epochs says, or why there is none, in a few lines."""
+    """The result of a search over filters and epochs, or why there is none, in a few lines."""
     if isinstance(combination, str):
         return f"no combined search: {combination}"
     count = len(combination.candidates)

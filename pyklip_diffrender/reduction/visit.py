@@ -101,7 +101,7 @@ _FRAME = 2.2
 
 @dataclass(frozen=True)
 class Contribution:
-    """What a frame of a reference star was used for."""
+    """Use of a frame of a reference star, and its share in the fit."""
 
     # Name of its file.
     name: str
@@ -120,7 +120,7 @@ class Contribution:
 
 @dataclass(frozen=True)
 class Visit:
-    """What the frames of reference stars have brought to a reduction."""
+    """Frames of reference stars in a reduction: their use, and the gain in the limits."""
 
     # One for each frame of a reference star.
     contributions: tuple[Contribution, ...] = ()

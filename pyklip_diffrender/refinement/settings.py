@@ -55,7 +55,7 @@ the star up to 1.5 times too bright, and limits 1.5 times higher. In the long-wa
 limits of two rolls of G 7-34 6 to 11 % higher from 0.4 to 1 arcsec, and is not used."""
 
 _DRIFTS = (" drift", " dither")
-"""What follows the names of groups of modes in those of `drift` and `dither_drift`."""
+"""Endings of the names of groups of modes in those of `drift` and `dither_drift`."""
 
 _DRIFT_RANGE = 4.0
 """Largest factor between the scale of a drift that maximises the evidence and the one stated."""
@@ -87,9 +87,10 @@ _QUICK: dict[str, Any] = {
     "relinearise": 0.3,
 }
 """Other settings of a first look. In single rolls of G 7-34 and HIP 17695 in F444W and F356W, 56
-pixels a side, limits were 0.87 to 1.13 times those of full fits, and it took 0.37 to 0.53 of their
+pixels a side, limits were 0.87 to 1.13 times those of full fits, and it took 0.37 to 0.58 of their
 time. Without accurate steps, limits are 1.3 times as large. With five wavelengths in the model, the
-flux of G 7-34 in F356W is 17 % too low; with three, the fit does not explain the frames."""
+flux of G 7-34 in F356W is 17 % below that of the full fit; with three, the fit does not explain the
+frames."""
 
 _PROCESS = 1.3e9
 """Memory that the package and PyTorch take, with what a fit needs for a while, bytes."""
@@ -319,16 +320,19 @@ class GaussNewton:
             Dithers may differ by as much as exposures with a slew between them.
         """
         changed = {}
-        slews = within.drift
+        slews: dict[str, float] = {}
+        if within.drift is not None:
+            reach = _DRIFT_RANGE if within.drift.fit_scales else 1.0
+            slews = {name: reach * scale for name, scale in within.drift.scales.items()}
         for field_name, label in (("drift", _DRIFTS[0]), ("dither_drift", _DRIFTS[1])):
             prior, middle = getattr(self, field_name), getattr(within, field_name)
             if prior is not None and middle.fit_scales:
                 own = _labelled(ratios, label)
-                largest = middle.scales if slews is None else slews.scales
                 scales = {
                     name: float(np.clip(own.get(name, 1.0) * scale,
                                         middle.scales[name] / _DRIFT_RANGE,
-                                        max(largest[name], middle.scales[name]) * _DRIFT_RANGE))
+                                        max(middle.scales[name] * _DRIFT_RANGE,
+                                            slews.get(name, 0.0))))
                     for name, scale in prior.scales.items()
                 }  # fmt: skip
                 changed[field_name] = replace(prior, scales=scales)

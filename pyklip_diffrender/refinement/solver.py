@@ -488,7 +488,7 @@ _POOR = 0.5
 
 @dataclass(frozen=True)
 class StepState:
-    """What one step of a fit hands on to the next."""
+    """Priors, damping and model error that one step of a fit hands on to the next."""
 
     priors: ModePriors  # With the scales that the step has fitted, unless they are fixed.
     damping: float = 0.0  # Levenberg-Marquardt damping of the next step.

@@ -152,8 +152,8 @@ def exposures_in(
     """Find FITS files, or those in folders, and read their headers; NoValidPixelsError for none.
 
     Files that are all marked as those of reference stars are of the target if there are
-    `references`. Of files that can be used with a `filter`, the frames are read at once, so that no
-    file is opened twice.
+    `references`. With a `filter`, the frames of its calints files are read at once, so that none of
+    these is opened twice; files of other levels may be copies, which are not read.
     """
     entries = [files] if isinstance(files, str | os.PathLike) else list(files)
     paths: list[Path] = []
@@ -169,7 +169,8 @@ def exposures_in(
         raise NoValidPixelsError("files: got none, expected at least one")
 
     def is_wanted(exposure: Exposure) -> bool:
-        return same_name(exposure.filter, filter) and not _why_unusable(exposure)
+        usable = same_name(exposure.filter, filter) and not _why_unusable(exposure)
+        return usable and _rank(exposure) == 0
 
     frames = False if filter is None else is_wanted
     listed = [FrameFile.opened(path, frames=frames) for path in paths]

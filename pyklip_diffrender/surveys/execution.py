@@ -385,7 +385,7 @@ def with_dask(
 
 
 def _why_not_spawned() -> str:
-    """What keeps new processes from importing the main module, as far as it can be seen."""
+    """Reason why new processes cannot import the main module, as far as it can be seen."""
     main = sys.modules.get("__main__")
     name = str(getattr(main, "__file__", None) or "<stdin>")
     if name.startswith("<") and not hasattr(sys, "ps1"):

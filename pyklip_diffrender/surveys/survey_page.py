@@ -218,7 +218,7 @@ def page(rows: Rows, stars: Sequence[StarSearch] = ()) -> str:
 
 
 def _title(rows: Rows) -> str:
-    """What the survey is of: its sequences, or the first of them and their number."""
+    """Title of a survey: its sequences, or the first of them and their number."""
     names = list(dict.fromkeys(job.name for job, _ in rows))
     if len(names) > _NAMES:
         return f"Survey of {names[0]} and {len(names) - 1} more sequences"
