@@ -214,6 +214,13 @@ class Noise:
             }
         return torch.cat([each.flatten(1) for each in white.values()], dim=1)
 
+    def at_pixels(self, pixels: Tensor) -> Noise:
+        """The same of some pixels only, indices (k,) into the flattened image: arrays are (k,)."""
+        return Noise(
+            tuple(each.flatten()[pixels] for each in self.weight),
+            tuple(each.flatten()[pixels] for each in self.common),
+        )
+
     def chi2(self, images: Sequence[Tensor]) -> float:
         """x^T C^-1 x of images x, (ny, nx), of all frames."""
         by_frame = dict(enumerate(images))
@@ -388,9 +395,7 @@ class LinearModel:
         count = {len(t) for t in templates.values()}
         if len(count) != 1:
             raise ShapeError(f"templates: got {sorted(count)} of them, expected one number")
-        return torch.linalg.solve_triangular(
-            self._factor, self._pulled(templates) * self._scale[:, None], upper=False
-        )
+        return self._solved(self._pulled(templates))
 
     def weigh(self, templates: Mapping[int, Tensor]) -> TemplateProducts:
         """Compute amplitudes of templates, one at a time, marginalised over all unknowns.
@@ -419,6 +424,24 @@ class LinearModel:
                 numerator += torch.tensordot(weighted, self.cleaned[k], dims=2)
             photon = (self.noise.whitened(part).double() ** 2).sum(dim=1)
             parts.append(TemplateProducts(numerator, photon - absorbed, photon))
+        return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+    def weigh_pixels(self, k: int, places: Tensor) -> TemplateProducts:
+        """The same as `weigh` for light in one pixel of frame k each, places (n, 2) as y, x."""
+        # Images of n single pixels would make all products with the Jacobian n times as long as
+        # the n columns of it that they amount to.
+        parts = []
+        for some in (places @ torch.tensor([self.frames[k].weight.shape[1], 1])).split(_BATCH):
+            noise = self.noise.at_pixels(some)
+            pulled = torch.zeros(len(self.vector), len(some), dtype=torch.float64)
+            weighted = noise.weighted({k: torch.ones(len(some), dtype=torch.float64)})
+            for number, values in weighted.items():
+                frame = self.frames[number]
+                columns = frame.jacobian.flatten(1)[:, some].double().mul_(values)
+                pulled += frame.onto_unknowns(columns, len(self.vector))
+            absorbed = self._solved(pulled).square_().sum(dim=0)
+            numerator = noise.weight[k] * self.cleaned[k].flatten()[some]
+            parts.append(TemplateProducts(numerator, weighted[k] - absorbed, weighted[k]))
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def response(self, templates: Mapping[int, Tensor]) -> Tensor:

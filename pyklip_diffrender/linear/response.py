@@ -549,17 +549,19 @@ class Reading:
     """Takes derivatives from a cache, and knows the largest error of those that it has taken.
 
     The cache computes derivatives again where the field has changed by more than `allowed`, and
-    stores `keep` responses; `farthest` is the largest change since those that were taken were
-    computed.
+    stores `keep` responses, no new ones if this is the last reading (`is_last`); `farthest` is the
+    largest change since those that were taken were computed.
     """
 
-    def __init__(self, cache: ResponseCache, allowed: float, keep: int) -> None:
-        self._cache, self._allowed, self._keep = cache, allowed, keep
+    def __init__(self, cache: ResponseCache, allowed: float, keep: int, is_last: bool) -> None:
+        self._cache, self._allowed, self._keep, self._is_last = cache, allowed, keep, is_last
         self.farthest = 0.0
 
     def near(self, opd: Tensor, values: dict[str, Tensor]) -> WavefrontResponse:
         """Take the response for nearly the same field, see `ResponseCache.near`."""
-        response, error = self._cache.response_within(opd, values, self._allowed, self._keep)
+        response, error = self._cache.response_within(
+            opd, values, self._allowed, self._keep, stores=not self._is_last
+        )
         self.farthest = max(self.farthest, error)
         return response
 
@@ -610,12 +612,15 @@ class ResponseCache:
         self._coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
         self._last_pupil = LastPupil(self._coarse)
 
-    def reading(self, allowed: float | None = None, keep: int | None = None) -> Reading:
+    def reading(
+        self, allowed: float | None = None, keep: int | None = None, *, is_last: bool = False
+    ) -> Reading:
         """Begin to take derivatives with another allowed error, or another number of responses."""
         return Reading(
             self,
             self._relinearise if allowed is None else allowed,
             self._keep if keep is None else keep,
+            is_last,
         )
 
     def parameters(
@@ -674,7 +679,13 @@ class ResponseCache:
         return self.reading().near(opd, values)
 
     def response_within(
-        self, opd: Tensor, values: dict[str, Tensor], allowed: float, keep: int
+        self,
+        opd: Tensor,
+        values: dict[str, Tensor],
+        allowed: float,
+        keep: int,
+        *,
+        stores: bool = True,
     ) -> tuple[WavefrontResponse, float]:
         """The response for nearly the same field, and its error; see `Reading`."""
         inside = opd[self.model.entrance.lit]
@@ -699,7 +710,7 @@ class ResponseCache:
             stored=False,
             progress=self.progress,
         )
-        if response.size <= self.memory:
+        if stores and response.size <= self.memory:
             self._make_room(response.size)
             response.store()
         self._kept.append((_About(inside, dict(values), dict(values)), response))

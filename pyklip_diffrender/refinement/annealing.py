@@ -29,7 +29,7 @@ from scipy.signal import fftconvolve
 from torch import Tensor
 
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.linear.model import LinearModel, Unknown
+from pyklip_diffrender.linear.model import LinearModel, TemplateProducts, Unknown
 from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, Status, pixel_grid
 from pyklip_diffrender.refinement.forward import Objective, Problem, State
 from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors, count_modes_below
@@ -223,9 +223,6 @@ _WRONG = 0.3
 pixel. The model of the companion's image may be wrong by more than the noise, and a second source
 would explain that no better than a single pixel."""
 
-_BATCH = 256
-"""Number of pixels whose deviations are computed at a time."""
-
 _MOST = 50
 """Largest number of pixels of a frame that are compared, the most deviating first."""
 
@@ -236,7 +233,7 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
     `linear` is about the state, with the full weights of all pixels.
     """
     companions = {k: (point.total - point.star).cpu() for k, point in enumerate(state.points)}
-    star_only = linear.without("companions", companions)
+    star_only: LinearModel | None = None
     outliers = []
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
         unknowns = point.unknowns
@@ -250,15 +247,23 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
         for row, column in _deviating(linear, k):
             place = grid[row, column]
             distances = ((companions_at - place) / scale).norm(dim=1)
-            pixel = _single_pixels(mask.shape, torch.tensor([[row, column]]))
-            sources = forward.sources(point, place + beside).cpu()
+            pixel = torch.tensor([[row, column]])
+            sources = {k: forward.sources(point, place + beside).cpu()}
             models = [linear]
             if bool((distances < _NEAR_COMPANION).any()):
+                if star_only is None:
+                    # It has its own copy of the Jacobians, as large as the fit's.
+                    star_only = linear.without("companions", companions)
                 light = companions[k][max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-                exceeds = float(_amplitude(linear, k, pixel).abs()) > _WRONG * float(light.max())
+                products = linear.weigh_pixels(k, pixel)
+                amplitude = products.numerator / products.information.clamp(min=1e-300)
+                exceeds = float(amplitude.abs()) > _WRONG * float(light.max())
                 models = [star_only, linear] if exceeds else [star_only]
             mask[row, column] = any(
-                bool(_explained(model, k, pixel) > _BETTER * _explained(model, k, sources).max())
+                bool(
+                    _explained(model.weigh_pixels(k, pixel))
+                    > _BETTER * _explained(model.weigh(sources)).max()
+                )
                 for model in models
             )
         outliers.append(mask)
@@ -269,32 +274,18 @@ def _deviating(linear: LinearModel, k: int) -> list[tuple[int, int]]:
     """Row and column of pixels that deviate more than those beside them, the most first."""
     cleaned = linear.cleaned[k]
     places = torch.nonzero(cleaned.abs() > _DEVIATES)
+    if not len(places):
+        return []
     deviations = torch.zeros_like(cleaned)
-    for start in range(0, len(places), _BATCH):
-        some = places[start : start + _BATCH]
-        explained = _explained(linear, k, _single_pixels(cleaned.shape, some))
-        deviations[some[:, 0], some[:, 1]] = explained.sqrt()
+    explained = _explained(linear.weigh_pixels(k, places))
+    deviations[places[:, 0], places[:, 1]] = explained.sqrt()
     peaks = local_maxima(deviations.numpy(), deviations.numpy() > 0, _SIGNIFICANT, size=3)
     return peaks[:_MOST]
 
 
-def _single_pixels(shape: torch.Size, places: Tensor) -> Tensor:
-    """Images with light in one pixel each, (k, ny, nx), for rows and columns (k, 2)."""
-    images = torch.zeros(len(places), *shape)
-    images[torch.arange(len(places)), places[:, 0], places[:, 1]] = 1.0
-    return images
-
-
-def _amplitude(linear: LinearModel, k: int, templates: Tensor) -> Tensor:
-    """Most probable amplitude of each template in frame k, (templates,)."""
-    products = linear.weigh({k: templates})
-    return products.numerator / products.information.clamp(min=1e-300)
-
-
-def _explained(linear: LinearModel, k: int, templates: Tensor) -> Tensor:
-    """Decrease of chi-squared by each template in frame k, (templates,)."""
+def _explained(products: TemplateProducts) -> Tensor:
+    """Decrease of chi-squared by each template, (templates,)."""
     # The amplitude a = p . Sigma^-1 r / p . Sigma^-1 p lowers chi-squared by a^2 p . Sigma^-1 p.
-    products = linear.weigh({k: templates})
     return products.numerator**2 / products.information.clamp(min=1e-300)
 
 

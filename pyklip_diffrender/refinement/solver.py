@@ -538,12 +538,17 @@ class EquationsCache:
         *,
         final: bool = False,
     ) -> NormalEquations:
-        """Linearise about a state, with derivatives whose error is at most `allowed`."""
+        """Linearise about a state, with derivatives whose error is at most `allowed`.
+
+        Nothing is linearised after the equations that are `final`.
+        """
         outweighing = 0.0 if final else kappa
         bright = state.bright_companions(outweighing)
         # Jacobians do not depend on the weights of pixels, so that they stay right at the same
         # state.
-        last, reading = self.last, self._responses.reading(allowed, len(state.points) + bright)
+        last = self.last
+        # Each response of the last reading is used once, and takes most of the memory.
+        reading = self._responses.reading(allowed, len(state.points) + bright, is_last=final)
         jacobians: list[Tensor] = []
         error = None
         if (
