@@ -139,8 +139,8 @@ def test_amplitudes_are_those_of_the_full_covariance(name, shown, request):
     torch.testing.assert_close(cleaned, white @ inverse, rtol=1e-5, atol=1e-5)
     pixels = torch.tensor([[1, 2], [3, 0], [2, 2]])
     single = torch.zeros(3, NY, NX).index_put((torch.arange(3), *pixels.T), torch.ones(()))
-    for got, wants in zip(model.weigh_pixels(shown[-1], pixels), model.weigh({shown[-1]: single})):
-        torch.testing.assert_close(got, wants, rtol=1e-5, atol=1e-6)
+    same = (model.weigh_pixels(shown[-1], pixels), model.weigh({shown[-1]: single}))
+    torch.testing.assert_close(*same, rtol=1e-5, atol=1e-6)
     if len(shown) == len(model.frames):
         matrix, vector = model.normal_equations(templates)
         torch.testing.assert_close(matrix, wanted, rtol=1e-5, atol=1e-5)

@@ -6,8 +6,9 @@ exposure to exposure whose size is measured, and with one flat-field pattern on 
 detector. What speaks against a frame is looked at in this order:
 
 1. Frames that the target's wavefront is far from explaining, or whose star is too faint, do not
-   take part.
-2. A companion of a reference star that the joint fit shows is subtracted and masked in its frames.
+   take part. If it explains them together with a point source or two beside the star, these are
+   subtracted and masked.
+2. A companion of a reference star that the joint fit shows is treated in the same way.
 3. Frames of a reference star that the joint fit does not explain as well as it does the target's
    are left out.
 4. If the limits of all frames together are not deeper than those of the target's frames alone,
@@ -34,7 +35,13 @@ from pyklip_diffrender.detection import Detection, contrast_curve, sources_of_re
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
-from pyklip_diffrender.refinement import GaussNewton, Refinement, align_frame, join_frames
+from pyklip_diffrender.refinement import (
+    FrameFit,
+    GaussNewton,
+    Refinement,
+    align_frame,
+    join_frames,
+)
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -70,6 +77,9 @@ _UNLIKE = 0.14
 frame spoils the fit of all and lets it converge slowly. In frames of stpsf whose wavefronts differ
 by 2 nm it was 0.05, between real stars hours apart 0.125, and 0.155 to 0.165 for AU Mic with its
 disk. It grows as 1 / wavelength."""
+
+_COMPANIONS = 2
+"""Largest number of point sources that are fitted with a reference star before that is judged."""
 
 _DITHERED = 3
 """Smallest number of frames of a star that join a target whose pattern the library knows: two rolls
@@ -209,13 +219,10 @@ def with_references(
             if not used:
                 break
             try:
-                aligned = _aligned(fit, used, settings, pattern, left_out)
-                used = [each for each in used if each.name in aligned]
+                used, aligned = _aligned(fit, used, settings, pattern, left_out, remarks)
                 if not used:
                     break
-                joint = join_frames(
-                    fit, list(aligned.values()), settings, systematics=pattern, progress=progress
-                )
+                joint = join_frames(fit, aligned, settings, systematics=pattern, progress=progress)
             except DiffrenderError as error:
                 _log.warning("the reference frames are not fitted with the target: %s", error)
                 left_out |= {each.name: f"the joint fit failed: {error}" for each in used}
@@ -294,14 +301,20 @@ def _aligned(
     settings: GaussNewton,
     pattern: Systematics | None,
     left_out: dict[str, str],
-) -> dict[str, Refinement]:
-    """Fits of frames with the target's wavefront, by name, of those that it nearly explains."""
+    remarks: dict[str, str],
+) -> tuple[list[Observation], list[Refinement]]:
+    """The frames that the target's wavefront nearly explains, and their fits with it.
+
+    Bright companions of the reference stars are subtracted from the frames and masked.
+    """
     wavelength = float(np.mean(fit.model.bandpass.wavelengths))
     limit = _UNLIKE * 4.4e-6 / wavelength
-    aligned = {}
+    observations, aligned = [], []
     for each in references:
         one = align_frame(fit, each, settings, systematics=pattern)
         brightness = one.frames[0].flux / fit.frames[0].flux
+        if brightness >= _FAINT and _unexplained(one) > limit:
+            each, one = _with_bright_companions(fit, each, one, settings, pattern, limit, remarks)
         reason = ""
         if brightness < _FAINT:
             reason = f"its star has {brightness:.2g} of the target's flux"
@@ -315,8 +328,62 @@ def _aligned(
             left_out[each.name] = reason
             _log.warning("%s is left out: %s", each.name, reason)
         else:
-            aligned[each.name] = one
-    return aligned
+            observations.append(each)
+            aligned.append(one)
+    return observations, aligned
+
+
+def _with_bright_companions(
+    fit: Refinement,
+    observation: Observation,
+    alone: Refinement,
+    settings: GaussNewton,
+    pattern: Systematics | None,
+    limit: float,
+    remarks: dict[str, str],
+) -> tuple[Observation, Refinement]:
+    """A frame without the companions that let the target's wavefront explain it, and its fit.
+
+    If there are none, these are the frame and the fit as they were.
+    """
+    several = align_frame(fit, observation, settings, systematics=pattern, companions=_COMPANIONS)
+    if not len(several.companions) or _unexplained(several) > limit:
+        return observation, alone
+    (frame,) = several.frames
+    without = _subtracted(
+        observation, frame, several.companions, frame.companion_image,
+        _MASKED * fit.model.resolution, remarks,
+    )  # fmt: skip
+    return without, align_frame(fit, without, settings, systematics=pattern)
+
+
+def _subtracted(
+    observation: Observation,
+    frame: FrameFit,
+    companions: Iterable[tuple[float, float, float]],
+    light: NDArray[np.float64],
+    radius: float,
+    remarks: dict[str, str],
+) -> Observation:
+    """A frame without the light (ny, nx) of companions, masked within a radius, arcsec, of them.
+
+    The companions are contrast, x and y, arcsec from the star. The frame is returned as it is if
+    nothing is left to mask.
+    """
+    masked = np.zeros(light.shape, dtype=bool)
+    texts = []
+    for contrast, x, y in companions:
+        masked |= np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y) < radius
+        texts.append(f"{contrast:.1e} of its star's light at {math.hypot(x, y):.2f} arcsec")
+    # It was subtracted and masked in an earlier round.
+    if not (observation.valid & masked).any():
+        return observation
+    are = "a source of {} is" if len(texts) == 1 else "sources of {} are"
+    remark = f"{are.format(' and '.join(texts))} subtracted and masked"
+    _log.warning("%s: %s", observation.name, remark)
+    known = remarks.get(observation.name)
+    remarks[observation.name] = f"{known}; {remark}" if known else remark
+    return replace(observation, data=observation.data - light, valid=observation.valid & ~masked)
 
 
 def _unexplained(aligned: Refinement) -> float:
@@ -377,29 +444,14 @@ def _with_companions_masked(
     joint: Refinement, used: Sequence[Observation], remarks: dict[str, str]
 ) -> list[Observation] | None:
     """Frames with the companions of reference stars masked; None if there are no new ones."""
-    masked, is_new = list(used), False
+    masked = list(used)
     science = len(joint.frames) - len(used)
     for k, source in sources_of_references(joint).items():
-        frame, observation = joint.frames[k], used[k - science]
-        x, y = source.offset
-        away = np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y)
-        near = away < _MASKED * joint.model.resolution
-        # It was subtracted and masked in an earlier round.
-        if not (observation.valid & near).any():
-            continue
-        is_new = True
-        remark = (
-            f"a source of {source.contrast:.1e} of its star's light at {math.hypot(x, y):.2f} "
-            "arcsec is subtracted and masked"
-        )
-        _log.warning("%s: %s", observation.name, remark)
-        known = remarks.get(observation.name)
-        remarks[observation.name] = f"{known}; {remark}" if known else remark
-        masked[k - science] = replace(
-            observation,
-            data=observation.data - source.light,
-            valid=observation.valid & ~near,
-        )
+        masked[k - science] = _subtracted(
+            used[k - science], joint.frames[k], [(source.contrast, *source.offset)], source.light,
+            _MASKED * joint.model.resolution, remarks,
+        )  # fmt: skip
+    is_new = any(one is not other for one, other in zip(masked, used, strict=True))
     return masked if is_new else None
 
 

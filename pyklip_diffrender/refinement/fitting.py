@@ -140,13 +140,14 @@ def align_frame(
     settings: GaussNewton,
     *,
     systematics: Systematics | None,
+    companions: int = 0,
 ) -> Refinement:
     """Fit place, flux and background of a frame with the wavefront of another fit.
 
-    Lyot stop, blur and internal aberrations are those of the fit, and the parameters in
-    `settings.own` are free. Pixels that are bad in all its frames of the same detector pixels are
-    left out. Raises `IncompatibleSetupError` for a frame that cannot share a fit with those of
-    `fit`, and `ShapeError` for one of another shape.
+    Lyot stop, blur and internal aberrations are those of the fit. The parameters in `settings.own`
+    are free, and those of at most `companions` point sources beside the star. Pixels that are bad
+    in all its frames of the same detector pixels are left out. Raises `IncompatibleSetupError` for
+    a frame that cannot share a fit with those of `fit`, and `ShapeError` for one of another shape.
     """
     first = fit.frames[0]
     require_agreement([*(frame.observation for frame in fit.frames), observation])
@@ -155,6 +156,9 @@ def align_frame(
         if None is not other.first_pixel == observation.first_pixel:
             known = other.valid.any(axis=0)
             observation = replace(observation, valid=observation.valid & known)
+    if companions:
+        # In frames of a reference star, companions are those of the target, which are not there.
+        observation = replace(observation, reference=False)
     own = tuple(name for name in settings.free if name in settings.own)
     alone = replace(
         settings,
@@ -164,7 +168,7 @@ def align_frame(
         drift=None,
         dither_drift=None,
         companions=(),
-        max_companions=0,
+        max_companions=companions,
         deviations={n: d for n, d in settings.deviations.items() if n in own},
     )
     # What is not the frame's own keeps the values of the fit: they are the starting values of
