@@ -6,8 +6,8 @@ exposure to exposure whose size is measured, and with one flat-field pattern on 
 detector. What speaks against a frame is looked at in this order:
 
 1. Frames that the target's wavefront is far from explaining, or whose star is too faint, do not
-   take part. If it explains them together with a point source or two beside the star, these are
-   subtracted and masked.
+   take part. If it explains them together with a point source beside the star, that is subtracted
+   and masked.
 2. A companion of a reference star that the joint fit shows is treated in the same way.
 3. Frames of a reference star that the joint fit does not explain as well as it does the target's
    are left out.
@@ -77,9 +77,6 @@ _UNLIKE = 0.14
 frame spoils the fit of all and lets it converge slowly. In frames of stpsf whose wavefronts differ
 by 2 nm it was 0.05, between real stars hours apart 0.125, and 0.155 to 0.165 for AU Mic with its
 disk. It grows as 1 / wavelength."""
-
-_COMPANIONS = 2
-"""Largest number of point sources that are fitted with a reference star before that is judged."""
 
 _DITHERED = 3
 """Smallest number of frames of a star that join a target whose pattern the library knows: two rolls
@@ -305,7 +302,7 @@ def _aligned(
 ) -> tuple[list[Observation], list[Refinement]]:
     """The frames that the target's wavefront nearly explains, and their fits with it.
 
-    Bright companions of the reference stars are subtracted from the frames and masked.
+    A bright companion of a reference star is subtracted from its frames and masked.
     """
     wavelength = float(np.mean(fit.model.bandpass.wavelengths))
     limit = _UNLIKE * 4.4e-6 / wavelength
@@ -314,7 +311,7 @@ def _aligned(
         one = align_frame(fit, each, settings, systematics=pattern)
         brightness = one.frames[0].flux / fit.frames[0].flux
         if brightness >= _FAINT and _unexplained(one) > limit:
-            each, one = _with_bright_companions(fit, each, one, settings, pattern, limit, remarks)
+            each, one = _with_bright_companion(fit, each, one, settings, pattern, limit, remarks)
         reason = ""
         if brightness < _FAINT:
             reason = f"its star has {brightness:.2g} of the target's flux"
@@ -333,7 +330,7 @@ def _aligned(
     return observations, aligned
 
 
-def _with_bright_companions(
+def _with_bright_companion(
     fit: Refinement,
     observation: Observation,
     alone: Refinement,
@@ -342,16 +339,16 @@ def _with_bright_companions(
     limit: float,
     remarks: dict[str, str],
 ) -> tuple[Observation, Refinement]:
-    """A frame without the companions that let the target's wavefront explain it, and its fit.
+    """A frame without a companion that keeps the target's wavefront from explaining it, and its fit.
 
-    If there are none, these are the frame and the fit as they were.
+    If there is none, these are the frame and the fit as they were.
     """
-    several = align_frame(fit, observation, settings, systematics=pattern, companions=_COMPANIONS)
-    if not len(several.companions) or _unexplained(several) > limit:
+    both = align_frame(fit, observation, settings, systematics=pattern, companions=1)
+    if not len(both.companions) or _unexplained(both) > limit:
         return observation, alone
-    (frame,) = several.frames
+    (frame,) = both.frames
     without = _subtracted(
-        observation, frame, several.companions, frame.companion_image,
+        observation, frame, both.companions, frame.companion_image,
         _MASKED * fit.model.resolution, remarks,
     )  # fmt: skip
     return without, align_frame(fit, without, settings, systematics=pattern)
@@ -393,7 +390,7 @@ def _unexplained(aligned: Refinement) -> float:
     (frame,) = aligned.frames
     observation = frame.observation.combined()
     valid = observation.valid[0]
-    square = (observation.data[0] - frame.star)[valid] ** 2
+    square = (observation.data[0] - frame.star - frame.companion_image)[valid] ** 2
     light = (frame.star - frame.values["background"][0])[valid] ** 2
     noise = observation.error[0][valid] ** 2
 
