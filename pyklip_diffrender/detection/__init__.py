@@ -9,7 +9,11 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 from __future__ import annotations
 
 from pyklip_diffrender.detection import metrics
-from pyklip_diffrender.detection.candidates import Candidates, sources_of_references
+from pyklip_diffrender.detection.candidates import (
+    Candidates,
+    ReferenceSource,
+    sources_of_references,
+)
 from pyklip_diffrender.detection.combined_result import COMBINED, Combination
 from pyklip_diffrender.detection.combined_search import combine
 from pyklip_diffrender.detection.detection_file import image_hdu
@@ -35,6 +39,7 @@ __all__ = [
     "Disk",
     "Hypotheses",
     "Motion",
+    "ReferenceSource",
     "SkyMap",
     "WideField",
     "combine",

@@ -31,7 +31,12 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import chi2
 
-from pyklip_diffrender.detection import Detection, contrast_curve, sources_of_references
+from pyklip_diffrender.detection import (
+    Detection,
+    ReferenceSource,
+    contrast_curve,
+    sources_of_references,
+)
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
@@ -339,48 +344,42 @@ def _with_bright_companion(
     limit: float,
     remarks: dict[str, str],
 ) -> tuple[Observation, Refinement]:
-    """A frame without a companion that keeps the target's wavefront from explaining it, and its fit.
+    """A frame without a companion that kept the wavefront from explaining it, and its fit.
 
     If there is none, these are the frame and the fit as they were.
     """
     both = align_frame(fit, observation, settings, systematics=pattern, companions=1)
     if not len(both.companions) or _unexplained(both) > limit:
         return observation, alone
-    (frame,) = both.frames
-    without = _subtracted(
-        observation, frame, both.companions, frame.companion_image,
-        _MASKED * fit.model.resolution, remarks,
-    )  # fmt: skip
+    (frame,), ((contrast, x, y),) = both.frames, both.companions.tolist()
+    source = ReferenceSource(contrast, (x, y), frame.companion_image)
+    without = _subtracted(observation, frame, source, remarks)
     return without, align_frame(fit, without, settings, systematics=pattern)
 
 
 def _subtracted(
-    observation: Observation,
-    frame: FrameFit,
-    companions: Iterable[tuple[float, float, float]],
-    light: NDArray[np.float64],
-    radius: float,
-    remarks: dict[str, str],
+    observation: Observation, frame: FrameFit, source: ReferenceSource, remarks: dict[str, str]
 ) -> Observation:
-    """A frame without the light (ny, nx) of companions, masked within a radius, arcsec, of them.
+    """A frame without the light of a point source, whose core is masked.
 
-    The companions are contrast, x and y, arcsec from the star. The frame is returned as it is if
-    nothing is left to mask.
+    The frame is returned as it is if nothing is left to mask.
     """
-    masked = np.zeros(light.shape, dtype=bool)
-    texts = []
-    for contrast, x, y in companions:
-        masked |= np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y) < radius
-        texts.append(f"{contrast:.1e} of its star's light at {math.hypot(x, y):.2f} arcsec")
+    x, y = source.offset
+    away = np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y)
+    near = away < _MASKED * frame.model.resolution
     # It was subtracted and masked in an earlier round.
-    if not (observation.valid & masked).any():
+    if not (observation.valid & near).any():
         return observation
-    are = "a source of {} is" if len(texts) == 1 else "sources of {} are"
-    remark = f"{are.format(' and '.join(texts))} subtracted and masked"
+    remark = (
+        f"a source of {source.contrast:.1e} of its star's light at {math.hypot(x, y):.2f} "
+        "arcsec is subtracted and masked"
+    )
     _log.warning("%s: %s", observation.name, remark)
     known = remarks.get(observation.name)
     remarks[observation.name] = f"{known}; {remark}" if known else remark
-    return replace(observation, data=observation.data - light, valid=observation.valid & ~masked)
+    return replace(
+        observation, data=observation.data - source.light, valid=observation.valid & ~near
+    )
 
 
 def _unexplained(aligned: Refinement) -> float:
@@ -444,10 +443,8 @@ def _with_companions_masked(
     masked = list(used)
     science = len(joint.frames) - len(used)
     for k, source in sources_of_references(joint).items():
-        masked[k - science] = _subtracted(
-            used[k - science], joint.frames[k], [(source.contrast, *source.offset)], source.light,
-            _MASKED * joint.model.resolution, remarks,
-        )  # fmt: skip
+        observation, frame = used[k - science], joint.frames[k]
+        masked[k - science] = _subtracted(observation, frame, source, remarks)
     is_new = any(one is not other for one, other in zip(masked, used, strict=True))
     return masked if is_new else None
 

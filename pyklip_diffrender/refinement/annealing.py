@@ -10,8 +10,8 @@ and decreases to 0, or to the value that the final residual requires:
    are significant in the residual.
 2. `Annealing._anneal` fits the wavefront as well, and lowers kappa from step to step. Where the fit
    stalls because of a bright companion, `Annealing._restart` adds that and goes back to the
-   alignment.
-3. `Annealing._finish` leaves out bad pixels, and widens a prior that is too narrow.
+   alignment; where it stalls because of bad pixels, these are left out.
+3. `Annealing._finish` leaves out the other bad pixels, and widens a prior that is too narrow.
 """
 
 from __future__ import annotations
@@ -75,6 +75,8 @@ class Course:
     # Companions may not be dropped after some were added to a fit that had stalled, or it might add
     # and drop them for ever.
     may_drop: bool = True
+    # Until a search for bad pixels finds none.
+    may_have_outliers: bool = True
 
 
 # Bright companions in the residual of a fit.
@@ -406,6 +408,10 @@ _ALIGNED = 0.05
 _OUTSHONE = 1.0
 """Model error, as a fraction of the star, from which something may outshine the star."""
 
+_STALLED = 0.01
+"""Gain in chi-squared per pixel of a step below which bad pixels are looked for. One that is not
+flagged can keep the model error at 3 %, and the fit would take six more steps that gain nothing."""
+
 _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
 
@@ -570,6 +576,8 @@ class Annealing:
         if bright:
             self._restart(course, bright)
             return False
+        if stalled and gain < _STALLED and course.may_have_outliers:
+            self._go_on_without_outliers(course)
         is_last = course.kappa <= floor and course.modes == len(self.basis)
         if is_last and self._drop_faint(course):
             return False
@@ -580,6 +588,15 @@ class Annealing:
             course.kappa = floor
         course.modes = self._modes_for(course.kappa)
         return False
+
+    def _go_on_without_outliers(self, course: Course) -> None:
+        """Leave out bad pixels that stand alone, without which the model error may be smaller."""
+        if self._leave_out_outliers(self._end_of(course), course.modes):
+            course.error = self.objective.model_error(course.state)
+            course.chi2 = self.objective.chi2_per_pixel(course.state)
+            course.best, course.least = course.state, (course.error, course.chi2)
+        else:
+            course.may_have_outliers = False
 
     def _restart(self, course: Course, added: Sequence[Planet]) -> None:
         """Go on with more companions: from here near the solution, else from the alignment."""
@@ -639,7 +656,7 @@ class Annealing:
     def _without_outliers(self, end: _Fitted) -> _Fitted:
         """Leave out bad pixels that stand alone, and go on without them."""
         for _ in range(_ROUNDS):
-            if not self._leave_out_outliers(end):
+            if not self._leave_out_outliers(end, self._all_modes):
                 break
             end = self._gone_on(end, _STEPS)
         return end
@@ -709,14 +726,15 @@ class Annealing:
                 break
         return state, carried
 
-    def _leave_out_outliers(self, end: _Fitted) -> bool:
-        """Leave out bad pixels that stand alone; False if there are none."""
+    def _leave_out_outliers(self, end: _Fitted, modes: int) -> bool:
+        """Leave out bad pixels that stand alone; False if there are none.
+
+        The first `modes` modes of the wavefront are those that the fit has adapted.
+        """
         state, priors = end.state, end.carried.priors
         for k in range(_SEARCHES):
             kappa = self._unexplained(state)
-            linear = self.solver.linear_model(
-                state, priors, kappa, self._all_modes, math.inf, final=False
-            )
+            linear = self.solver.linear_model(state, priors, kappa, modes, math.inf, final=False)
             outliers = isolated_outliers(self.objective, state, linear)
             del linear  # The next one is as large.
             if not any(bool(each.any()) for each in outliers):
