@@ -52,6 +52,9 @@ __all__ = [
 
 # The course of a fit: its states, and how far it has come.
 
+_ROUNDS = 6
+"""Largest number of states at which bad pixels are searched."""
+
 NOTHING = (math.inf, math.inf)
 """Model error and chi-squared of no state."""
 
@@ -75,8 +78,7 @@ class Course:
     # Companions may not be dropped after some were added to a fit that had stalled, or it might add
     # and drop them for ever.
     may_drop: bool = True
-    # Until a search for bad pixels finds none.
-    may_have_outliers: bool = True
+    outlier_searches: int = _ROUNDS  # Number of searches for bad pixels that may follow.
 
 
 # Bright companions in the residual of a fit.
@@ -412,15 +414,16 @@ _STALLED = 0.01
 """Gain in chi-squared per pixel of a step below which bad pixels are looked for. One that is not
 flagged can keep the model error at 3 %, and the fit would take six more steps that gain nothing."""
 
+_SPOILED = 0.01
+"""Model error without bad pixels from which a fit that had them goes back to the alignment, if they
+made more than half of its chi-squared."""
+
 _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
 
 _SEARCHES = 6
 """Largest number of searches for bad pixels at one state: a bright one hides fainter ones beside
 it."""
-
-_ROUNDS = 6
-"""Largest number of states at which bad pixels are searched."""
 
 _STEPS = 4
 """Largest number of steps after pixels were left out or the noise has changed, which both do little
@@ -576,8 +579,10 @@ class Annealing:
         if bright:
             self._restart(course, bright)
             return False
-        if stalled and gain < _STALLED and course.may_have_outliers:
+        if stalled and gain < _STALLED and course.outlier_searches:
             self._go_on_without_outliers(course)
+            if not course.modes:
+                return False
         is_last = course.kappa <= floor and course.modes == len(self.basis)
         if is_last and self._drop_faint(course):
             return False
@@ -591,34 +596,43 @@ class Annealing:
 
     def _go_on_without_outliers(self, course: Course) -> None:
         """Leave out bad pixels that stand alone, without which the model error may be smaller."""
-        if self._leave_out_outliers(self._end_of(course), course.modes):
-            course.error = self.objective.model_error(course.state)
-            course.chi2 = self.objective.chi2_per_pixel(course.state)
-            course.best, course.least = course.state, (course.error, course.chi2)
-        else:
-            course.may_have_outliers = False
+        course.outlier_searches -= 1
+        if not self._leave_out_outliers(self._end_of(course), course.modes):
+            course.outlier_searches = 0
+            return
+        course.least, course.remaining = NOTHING, self.settings.max_iterations
+        course.error = self.objective.model_error(course.state)
+        # A very bad pixel has the wavefront fitted to itself.
+        fewer = self.objective.chi2_per_pixel(course.state) < course.chi2 / 2
+        if fewer and course.error > _SPOILED:
+            self._back_to_alignment(course, course.aligned)
+        course.best = course.state
 
     def _restart(self, course: Course, added: Sequence[Planet]) -> None:
         """Go on with more companions: from here near the solution, else from the alignment."""
         is_close = course.error < _NEAR
-        # Near the solution the model is linear, so that further steps remove the bias of the
-        # wavefront.
-        course.state = self._with_companions(course.state if is_close else course.aligned, added)
         course.least, course.remaining = NOTHING, self.settings.max_iterations
         course.may_drop, course.carried = False, course.carried.without_damping()
         if is_close:
-            # Images are less linear in positions than in the wavefront, and steps of these few
-            # unknowns are cheap.
+            # Near the solution the model is linear, so that further steps remove the bias of the
+            # wavefront. Images are less linear in positions than in the wavefront, and steps of
+            # these few unknowns are cheap.
             course.state, course.carried = self._settled(
-                course.state, course.carried, _COMPANION_STEPS, modes=0
+                self._with_companions(course.state, added),
+                course.carried,
+                _COMPANION_STEPS,
+                modes=0,
             )
         else:
-            priors = replace(course.carried.priors, scales=self._first.priors.scales)
-            course.carried = replace(course.carried, priors=priors)
-            course.modes = 0
-            floor = self.settings.min_model_error
-            course.kappa = max(self.objective.model_error(course.state), floor)
+            self._back_to_alignment(course, self._with_companions(course.aligned, added))
         course.best = course.state
+
+    def _back_to_alignment(self, course: Course, state: State) -> None:
+        """Go on from a state of the alignment, with the priors of the beginning."""
+        priors = replace(course.carried.priors, scales=self._first.priors.scales)
+        course.state, course.modes = state, 0
+        course.carried = replace(course.carried.without_damping(), priors=priors)
+        course.kappa = max(self.objective.model_error(state), self.settings.min_model_error)
 
     def _drop_faint(self, course: Course) -> bool:
         """Go on without companions of the alignment that were errors of the wavefront.
