@@ -145,7 +145,9 @@ class NormalEquations:
     current: Tensor  # (unknowns,), unknowns of the state minus their starting values.
     frames: tuple[LinearFrame, ...]
     bright_companions: int  # Number of companions, over all frames, that count in the Jacobians.
-    error: float = 0.0  # Largest error of the derivatives, as that of a `Reading`.
+    # Largest error of the derivatives, as that of a `Reading`; in frames of reference stars over
+    # what is allowed there, times what is allowed in others.
+    error: float = 0.0
     # Whether curvature and gradient have the present weights of the pixels. If not, only the
     # Jacobians can be used again, and the curvature to precondition.
     has_weights: bool = True
@@ -192,12 +194,14 @@ def linearise(
     jacobians: Sequence[Tensor] = (),
     outweighing: float = 0.0,
     reading: Reading | None = None,
+    of_references: Reading | None = None,
 ) -> NormalEquations:
     """Linearise all frames about a state, with its first `modes` modes.
 
     `jacobians` are those of all frames at this state, if they are known; otherwise `reading` takes
-    the derivatives of the field. The model error `outweighing` decides which companions count in
-    them, see `brightest`. A wavefront that drifts between frames needs all modes.
+    the derivatives of the field, and `of_references` those for frames of reference stars. The model
+    error `outweighing` decides which companions count in them, see `brightest`. A wavefront that
+    drifts between frames needs all modes.
     """
     size = state.unknowns.with_modes(modes)
     # S_f distributes the rows of frame f onto the unknowns: that of a leading mode to the shared
@@ -219,9 +223,8 @@ def linearise(
         residual, weight, common = (
             each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k])
         )
-        rendered = (
-            jacobians[k] if jacobians else forward.jacobian(point, modes, outweighing, reading)
-        )
+        own = of_references if forward.problem.observation.reference else reading
+        rendered = jacobians[k] if jacobians else forward.jacobian(point, modes, outweighing, own)
         part = state.unknowns.rows[k]
         rows, first = part.rows[: len(rendered)], part.first_mode
         drift = part.drift if modes else part.drift[:, :0]
@@ -246,7 +249,7 @@ def linearise(
     gradient = gradient + curvature @ current
     return NormalEquations(
         state, kappa, robust, curvature, gradient, current, tuple(frames),
-        state.bright_companions(outweighing), 0.0 if reading is None else reading.farthest,
+        state.bright_companions(outweighing),
     )  # fmt: skip
 
 
@@ -546,9 +549,13 @@ class EquationsCache:
         bright = state.bright_companions(outweighing)
         # Jacobians do not depend on the weights of pixels, so that they stay right at the same
         # state.
-        last = self.last
+        last, keep = self.last, len(state.points) + bright
         # Each response of the last reading is used once, and takes most of the memory.
-        reading = self._responses.reading(allowed, len(state.points) + bright, is_last=final)
+        reading = self._responses.reading(allowed, keep, is_last=final)
+        # Limits for the target hardly depend on the derivatives of reference stars: with 0.05 they
+        # are the same to 4e-4 as with 0.01.
+        rough = max(allowed, _ACCURATE)
+        of_references = self._responses.reading(rough, keep, is_last=final)
         jacobians: list[Tensor] = []
         error = None
         if (
@@ -561,9 +568,12 @@ class EquationsCache:
             jacobians, error = [frame.jacobian for frame in last.frames], last.error
         last = self.last = None
         equations = linearise(
-            self._objective, state, kappa, modes, robust, jacobians, outweighing, reading
-        )
-        self.last = equations if error is None else replace(equations, error=error)
+            self._objective, state, kappa, modes, robust, jacobians, outweighing,
+            reading, of_references,
+        )  # fmt: skip
+        if error is None:
+            error = max(reading.farthest, of_references.farthest * allowed / rough)
+        self.last = replace(equations, error=error)
         self._preconditions = True
         return self.last
 
