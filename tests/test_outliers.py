@@ -70,9 +70,10 @@ def test_a_hot_pixel_is_no_planet():
     assert again.chi2_per_pixel == pytest.approx(fit.chi2_per_pixel, rel=0.01)
 
 
-def test_the_star_is_fitted_without_a_dead_pixel():
-    """One that is 60 sigma too faint raises chi-squared per pixel to 4 if it stays."""
-    frame = spoiled(shot(), -60.0)
+@pytest.mark.parametrize("sigmas", [-60.0, 1000.0])
+def test_the_star_is_fitted_without_a_bad_pixel(sigmas):
+    """Chi-squared per pixel is 4 and 400 if it stays, and the latter has the wavefront fitted."""
+    frame = spoiled(shot(), sigmas)
     fit = fitted(frame)
     assert left_out(fit) == [PIXEL]
     assert fit.chi2_per_pixel == pytest.approx(1.0, abs=0.1)

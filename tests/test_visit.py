@@ -131,10 +131,14 @@ def test_references_make_the_limits_deeper_and_leave_the_planet_alone():
 
 
 @pytest.mark.slow
-def test_a_companion_of_a_reference_is_masked_and_named():
-    fit, visit, used = joined(*(reference(k, companion=4e-4) for k in range(2)))
+@pytest.mark.parametrize("contrast", [4e-4, 5e-3])
+def test_a_companion_of_a_reference_is_masked_and_named(contrast):
+    """One that the joint fit shows, and one without which the frames would not be in it."""
+    fit, visit, used = joined(*(reference(k, companion=contrast) for k in range(2)))
     assert used == ["joint"] * 2
+    assert visit.gain > 1.1
     for each in visit.contributions:
+        assert f"{contrast:.0e}"[:1] in each.reason
         assert "arcsec is subtracted and masked" in each.reason
     for part in fit.frames[2:]:
         away = np.hypot(part.grid[..., 0] - 0.5, part.grid[..., 1] + 0.4)
