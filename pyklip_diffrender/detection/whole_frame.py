@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -15,7 +16,7 @@ from astropy.stats import SigmaClip
 from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, map_coordinates
+from scipy.ndimage import convolve, map_coordinates, uniform_filter
 from scipy.signal import fftconvolve
 
 from pyklip_diffrender.detection.field import (
@@ -31,7 +32,7 @@ from pyklip_diffrender.scene.observation import Observation
 if TYPE_CHECKING:
     from photutils.psf import ImagePSF
 
-__all__ = ["EDGE", "REACH", "WholeFrame"]
+__all__ = ["EDGE", "REACH", "WholeFrame", "has_bright_pixels_beyond", "light_from_beyond"]
 
 
 EDGE = 16
@@ -342,3 +343,98 @@ class WholeFrame:
         errors = np.array([fitted["flux_err"], *np.sqrt(turned)], dtype=float)
         usable = np.isfinite(values).all() and (errors > 0).all() and self.searches(place)
         return (values, errors, float(fitted["reduced_chi2"])) if usable else None
+
+
+# Bright sources beyond the fitted pixels, whose light inside them would keep a fit from converging.
+
+_log = logging.getLogger(__name__)
+
+_SHARE = 0.2
+"""Brightness of pixels beyond the fitted ones, relative to the brightest of these, from which there
+may be such a source. One of 1e-3 of the star's flux has about that in F444W."""
+
+_BRIGHT = 50.0
+"""Smallest S/N of such a source. The search of whole frames finds the fainter ones."""
+
+_SEEN = 30.0
+"""Smallest S/N of its light in all fitted pixels together."""
+
+_MOST = 5
+"""Largest number of such sources in a frame."""
+
+_LEFT = 0.3
+"""Largest part of a point source's light, in absolute values, that its fit leaves."""
+
+
+def _pixels_inside(whole: Observation, cut: Observation) -> tuple[slice, slice]:
+    """Rows and columns of a whole frame that the fit takes."""
+    column, row = np.rint(whole.center[0] - cut.center[0]).astype(int)
+    ny, nx = cut.shape
+    return slice(row, row + ny), slice(column, column + nx)
+
+
+def has_bright_pixels_beyond(whole: Observation, cut: Observation) -> bool:
+    """Whether a frame may have a bright source beyond the pixels of its cutout."""
+    combined = whole.combined()
+    valid = combined.valid[0]
+    if not valid.any():
+        return False
+    image = np.where(valid, combined.data[0] - np.median(combined.data[0][valid]), 0.0)
+    smooth = uniform_filter(image, 3)
+    inside = _pixels_inside(whole, cut)
+    outside = smooth.copy()
+    outside[inside] = 0.0
+    return bool(outside[EDGE:-EDGE, EDGE:-EDGE].max(initial=0.0) > _SHARE * smooth[inside].max())
+
+
+def light_from_beyond(
+    fits: Sequence[FrameFit], wholes: Sequence[Observation], cuts: Sequence[Observation]
+) -> list[Image]:
+    """Light of bright point sources beyond the fitted pixels, in these pixels, by frame.
+
+    Only the wavefront of `fits` and the product of flux and contrast count, so that rough fits of
+    the star do.
+    """
+    lights = []
+    for fit, whole, cut in zip(fits, wholes, cuts, strict=True):
+        frame, inside = WholeFrame(fit, whole, 0.0), _pixels_inside(whole, cut)
+        noise = np.where(cut.combined().valid[0], cut.combined().error[0], np.inf)
+        light = np.zeros(cut.shape)
+        for source in _bright_sources(frame, inside):
+            own = frame.light(source[None, 1:], source[:1])[inside]
+            if np.linalg.norm(own / noise) > _SEEN:
+                light += own
+                _log.warning(
+                    "%s: the light of a bright source beyond the fitted pixels, at x, y = %.2f, "
+                    "%.2f arcsec, is subtracted from them; wide=True (--wide) measures it",
+                    whole.name, *source[1:],
+                )  # fmt: skip
+        lights.append(light)
+    return lights
+
+
+def _bright_sources(frame: WholeFrame, inside: tuple[slice, slice]) -> list[Image]:
+    """Contrast, x and y of bright point sources beyond the fitted pixels, the brightest first."""
+    allowed = frame.searches(frame.grid)
+    allowed[inside] = False
+    image = frame.residual
+    sources: list[Image] = []
+    while allowed.any() and len(sources) < _MOST:
+        numerator, information = frame.products(image)
+        snr = np.where(allowed, numerator / np.sqrt(np.maximum(information, 1e-300)), 0.0)
+        peak = np.unravel_index(snr.argmax(), snr.shape)
+        if snr[peak] < _BRIGHT:
+            break
+        place = frame.grid[peak]
+        window = frame.window_about(place, _FITTED)
+        # Its lobes are not looked at again.
+        allowed &= separation_of(frame.grid - place) > _CORE
+        fitted = frame.photometry(image, place, float(numerator[peak] / information[peak]))
+        if fitted is None:
+            continue
+        values = fitted[0]
+        left = image - frame.light(values[None, 1:], values[:1])
+        if np.abs(left[window]).sum() < _LEFT * np.abs(image[window]).sum():
+            image = left
+            sources.append(values)
+    return sources

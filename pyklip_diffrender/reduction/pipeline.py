@@ -22,6 +22,8 @@ from pyklip_diffrender.detection import (
     completeness,
     detect,
     fit_disk,
+    has_bright_pixels_beyond,
+    light_from_beyond,
     recover_planets,
     require_outer_pixels,
     wide_field,
@@ -197,6 +199,13 @@ def on_extended_light(candidates: QTable, offsets: NDArray[np.float64], resoluti
 
 
 # The result of a reduction.
+
+_ROUGH_STEPS = 4
+"""Steps of the alignment with which bright sources beyond the fitted pixels are looked for."""
+
+_BEYOND = 0.15
+"""Error of the light of such a source, relative to it, with the wavefront of a map that is some
+days old: 0.16 of it was left. With a fitted wavefront it is a third of that."""
 
 _LARGE = 4.0
 """Chi-squared per pixel above which more is missing than what real frames leave where the pattern
@@ -441,7 +450,7 @@ class _Run:
             for_pattern = options.references == "pattern" or options.systematics == "references"
             for_pattern = for_pattern or (options.disk and options.references == "joint")
             choice, fit = fit_with_pattern(
-                self.preparation.sequence.science,
+                self._science,
                 self.preparation.sequence.references if for_pattern else (),
                 self.preparation.model,
                 self.preparation.wavefront,
@@ -498,7 +507,9 @@ class _Run:
         if options.wide:
             with stage("whole frames"):
                 wide = wide_field(detection, whole)
-            cleaned = None if "wide" in done else wide.subtracted(whole, sequence.science)
+            cleaned = None
+            if "wide" not in done:
+                cleaned = wide.subtracted(whole, self._untouched(sequence.science))
             if cleaned is not None:
                 with stage("star and search without the light of sources beyond the fitted pixels"):
                     fit, visit, again = self._with_references(self._fit(cleaned, choice), choice)
@@ -518,6 +529,52 @@ class _Run:
             keep("completeness")
         self._require_plausible(detection.fits[0])  # It may have been fitted with companions.
         return reduction()
+
+    @cached_property
+    def _science(self) -> tuple[Observation, ...]:
+        """The target's frames without the light of bright sources beyond the fitted pixels."""
+        prepared = self.preparation
+        whole, cut = prepared.whole.science, prepared.sequence.science
+        if not any(map(has_bright_pixels_beyond, whole, cut)):
+            return cut
+        settings = prepared.settings or settings_for(cut[0])
+        aligned = replace(
+            settings,
+            wavefront=False,
+            max_companions=0,
+            companions_if_stalled=False,
+            max_iterations=_ROUGH_STEPS,
+        )
+        cleaned = cut
+        with stage("bright sources beyond the fitted pixels"):
+            for each, error in ((aligned, _BEYOND), (rough_settings(settings), _BEYOND / 3)):
+                fit = refine(
+                    prepared.model,
+                    cleaned,
+                    prepared.wavefront,
+                    settings=each,
+                    start=prepared.options.start,
+                    progress=self.progress,
+                )
+                lights = light_from_beyond(fit.frames, whole, cut)
+                if not any(light.any() for light in lights):
+                    return cut
+                cleaned = tuple(
+                    replace(
+                        frame,
+                        data=frame.data - light,
+                        error=np.hypot(frame.error, error * light),
+                    )
+                    for frame, light in zip(cut, lights, strict=True)
+                )
+        return cleaned
+
+    def _untouched(self, science: Iterable[Observation]) -> tuple[Observation, ...]:
+        """Frames of the target with the light of all sources."""
+        return tuple(
+            replace(each, data=before.data, error=before.error)
+            for each, before in zip(science, self.preparation.sequence.science, strict=True)
+        )
 
     @staticmethod
     def _has(injections: QTable | None, count: int) -> bool:
@@ -545,7 +602,7 @@ class _Run:
         if saved.origin != "library":
             known = saved.systematics or "off"
         choice = choose_systematics(
-            self.preparation.sequence.science,
+            self._science,
             (),
             self.preparation.model,
             self.preparation.wavefront,

@@ -153,18 +153,25 @@ def exposures_in(
 
     Files that are all marked as those of reference stars are of the target if there are
     `references`. With a `filter`, the frames of its calints files are read at once, so that none of
-    these is opened twice; files of other levels may be copies, which are not read.
+    these is opened twice; files of other levels may be copies, which are not read. Raises
+    `IncompatibleSetupError` for what is no path.
     """
-    entries = [files] if isinstance(files, str | os.PathLike) else list(files)
+    entries = list(files) if isinstance(files, Iterable) and not isinstance(files, str) else [files]
     paths: list[Path] = []
-    for each in map(Path, entries):
-        if each.is_dir():
-            inside = fits_files(each)
+    for each in entries:
+        if not isinstance(each, str | os.PathLike):
+            raise IncompatibleSetupError(
+                f"files: got a {type(each).__name__}, expected paths of FITS files or folders. "
+                "Frames in memory go into a Sequence: Sequence(target, (frame, ...))"
+            )
+        path = Path(each)
+        if path.is_dir():
+            inside = fits_files(path)
             if not inside:
-                raise NoValidPixelsError(f"{each}: the folder has no FITS files")
+                raise NoValidPixelsError(f"{path}: the folder has no FITS files")
             paths += inside
         else:
-            paths.append(each)
+            paths.append(path)
     if not paths:
         raise NoValidPixelsError("files: got none, expected at least one")
 
