@@ -600,12 +600,12 @@ class Annealing:
         if not self._leave_out_outliers(self._end_of(course), course.modes):
             course.outlier_searches = 0
             return
-        course.least, course.remaining = NOTHING, self.settings.max_iterations
-        course.error = self.objective.model_error(course.state)
+        course.least, course.error = NOTHING, self.objective.model_error(course.state)
         # A very bad pixel has the wavefront fitted to itself.
         fewer = self.objective.chi2_per_pixel(course.state) < course.chi2 / 2
         if fewer and course.error > _SPOILED:
             self._back_to_alignment(course, course.aligned)
+            course.remaining = self.settings.max_iterations
         course.best = course.state
 
     def _restart(self, course: Course, added: Sequence[Planet]) -> None:
