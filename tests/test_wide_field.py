@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import disk as module
-from pyklip_diffrender.detection import has_bright_pixels_beyond, light_from_beyond, wide_field
+from pyklip_diffrender.detection import has_bright_pixels_beyond, sources_beyond, wide_field
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -85,7 +85,7 @@ def crowded():
     return detection, frame, wide_field(detection, [frame])
 
 
-def test_a_bright_source_beyond_the_fitted_pixels_is_taken_out_of_them():
+def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit():
     """Its lobes are 27 times the noise of each pixel, and a fit of the star alone never ends."""
     source, opd = dr.Planet(3e-3, separation=2.1, position_angle=200.0), dr.random_opd(1, npix=128)
     alone, frame = (
@@ -93,17 +93,18 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_taken_out_of_them():
         for planets in ((), (source,))
     )
     before, cut = alone.cutout(FITTED), frame.cutout(FITTED)
-    assert [has_bright_pixels_beyond(alone, before), has_bright_pixels_beyond(frame, cut)] == [
-        False, True,
-    ]  # fmt: skip
+    assert not has_bright_pixels_beyond(alone, before)
+    assert has_bright_pixels_beyond(frame, cut)
     settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False, max_iterations=4)
-    fit = dr.refine(model(FITTED), cut, opd, settings=settings)
-    (light,) = light_from_beyond(fit.frames, [frame], [cut])
+    true, fit = (dr.refine(model(FITTED), each, opd, settings=settings) for each in (before, cut))
+    ((planet,), (light,)) = sources_beyond(fit.frames, [frame], [cut])
+    of_star = fit.frames[0].flux / true.frames[0].flux
+    assert planet.contrast * of_star == pytest.approx(3e-3, rel=0.1)
+    assert np.hypot(*np.subtract(planet.offset, source.offset)) < 0.05
     assert np.std(light / cut.error[0]) > 20
     left = (cut.data - before.data)[0] - light
     assert np.std(left / np.hypot(cut.error[0], before.error[0])) < 1.5
-    (nothing,) = light_from_beyond(fit.frames, [alone], [before])
-    assert not nothing.any()
+    assert not sources_beyond(fit.frames, [alone], [before])[0]
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -27,12 +26,13 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.refinement.fit_result import pixel_grid
+from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 
 if TYPE_CHECKING:
     from photutils.psf import ImagePSF
 
-__all__ = ["EDGE", "REACH", "WholeFrame", "has_bright_pixels_beyond", "light_from_beyond"]
+__all__ = ["EDGE", "REACH", "WholeFrame", "has_bright_pixels_beyond", "sources_beyond"]
 
 
 EDGE = 16
@@ -347,8 +347,6 @@ class WholeFrame:
 
 # Bright sources beyond the fitted pixels, whose light inside them would keep a fit from converging.
 
-_log = logging.getLogger(__name__)
-
 _SHARE = 0.2
 """Brightness of pixels beyond the fitted ones, relative to the brightest of these, from which there
 may be such a source. One of 1e-3 of the star's flux has about that in F444W."""
@@ -358,6 +356,9 @@ _BRIGHT = 50.0
 
 _SEEN = 30.0
 """Smallest S/N of its light in all fitted pixels together."""
+
+_SAME = 0.2
+"""arcsec between the places of a source in two frames that were aligned roughly."""
 
 _MOST = 5
 """Largest number of such sources in a frame."""
@@ -387,14 +388,15 @@ def has_bright_pixels_beyond(whole: Observation, cut: Observation) -> bool:
     return bool(outside[EDGE:-EDGE, EDGE:-EDGE].max(initial=0.0) > _SHARE * smooth[inside].max())
 
 
-def light_from_beyond(
+def sources_beyond(
     fits: Sequence[FrameFit], wholes: Sequence[Observation], cuts: Sequence[Observation]
-) -> list[Image]:
-    """Light of bright point sources beyond the fitted pixels, in these pixels, by frame.
+) -> tuple[list[Planet], list[Image]]:
+    """Bright point sources beyond the fitted pixels, and their light in these pixels, by frame.
 
-    Only the wavefront of `fits` and the product of flux and contrast count, so that rough fits of
-    the star do.
+    The sources are in the orientation of the first frame. Rough fits of the star do for their
+    light, for which only the wavefront counts; contrasts are as wrong as the flux of the star.
     """
+    planets: list[Planet] = []
     lights = []
     for fit, whole, cut in zip(fits, wholes, cuts, strict=True):
         frame, inside = WholeFrame(fit, whole, 0.0), _pixels_inside(whole, cut)
@@ -402,15 +404,14 @@ def light_from_beyond(
         light = np.zeros(cut.shape)
         for source in _bright_sources(frame, inside):
             own = frame.light(source[None, 1:], source[:1])[inside]
-            if np.linalg.norm(own / noise) > _SEEN:
-                light += own
-                _log.warning(
-                    "%s: the light of a bright source beyond the fitted pixels, at x, y = %.2f, "
-                    "%.2f arcsec, is subtracted from them; wide=True (--wide) measures it",
-                    whole.name, *source[1:],
-                )  # fmt: skip
+            if np.linalg.norm(own / noise) < _SEEN:
+                continue
+            light += own
+            planet = Planet.from_offset(*source.tolist()).rotated(-whole.roll_from(wholes[0]))
+            if all(math.dist(planet.offset, each.offset) > _SAME for each in planets):
+                planets.append(planet)
         lights.append(light)
-    return lights
+    return planets, lights
 
 
 def _bright_sources(frame: WholeFrame, inside: tuple[slice, slice]) -> list[Image]:

@@ -23,9 +23,9 @@ from pyklip_diffrender.detection import (
     detect,
     fit_disk,
     has_bright_pixels_beyond,
-    light_from_beyond,
     recover_planets,
     require_outer_pixels,
+    sources_beyond,
     wide_field,
 )
 from pyklip_diffrender.errors import (
@@ -59,6 +59,7 @@ from pyklip_diffrender.refinement import (
     to_jansky,
     with_star_flux,
 )
+from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.simulation import model_for
@@ -200,12 +201,8 @@ def on_extended_light(candidates: QTable, offsets: NDArray[np.float64], resoluti
 
 # The result of a reduction.
 
-_ROUGH_STEPS = 4
+_ALIGNING = 4
 """Steps of the alignment with which bright sources beyond the fitted pixels are looked for."""
-
-_BEYOND = 0.15
-"""Error of the light of such a source, relative to it, with the wavefront of a map that is some
-days old: 0.16 of it was left. With a fitted wavefront it is a third of that."""
 
 _LARGE = 4.0
 """Chi-squared per pixel above which more is missing than what real frames leave where the pattern
@@ -450,7 +447,7 @@ class _Run:
             for_pattern = options.references == "pattern" or options.systematics == "references"
             for_pattern = for_pattern or (options.disk and options.references == "joint")
             choice, fit = fit_with_pattern(
-                self._science,
+                self.preparation.sequence.science,
                 self.preparation.sequence.references if for_pattern else (),
                 self.preparation.model,
                 self.preparation.wavefront,
@@ -507,9 +504,7 @@ class _Run:
         if options.wide:
             with stage("whole frames"):
                 wide = wide_field(detection, whole)
-            cleaned = None
-            if "wide" not in done:
-                cleaned = wide.subtracted(whole, self._untouched(sequence.science))
+            cleaned = None if "wide" in done else wide.subtracted(whole, sequence.science)
             if cleaned is not None:
                 with stage("star and search without the light of sources beyond the fitted pixels"):
                     fit, visit, again = self._with_references(self._fit(cleaned, choice), choice)
@@ -531,50 +526,48 @@ class _Run:
         return reduction()
 
     @cached_property
-    def _science(self) -> tuple[Observation, ...]:
-        """The target's frames without the light of bright sources beyond the fitted pixels."""
+    def _beyond(self) -> tuple[Planet, ...]:
+        """Bright sources beyond the fitted pixels, to be fitted with the star."""
         prepared = self.preparation
         whole, cut = prepared.whole.science, prepared.sequence.science
         if not any(map(has_bright_pixels_beyond, whole, cut)):
-            return cut
-        settings = prepared.settings or settings_for(cut[0])
+            return ()
         aligned = replace(
-            settings,
+            prepared.settings or settings_for(cut[0]),
             wavefront=False,
+            companions=(),
             max_companions=0,
             companions_if_stalled=False,
-            max_iterations=_ROUGH_STEPS,
+            max_iterations=_ALIGNING,
         )
-        cleaned = cut
-        with stage("bright sources beyond the fitted pixels"):
-            for each, error in ((aligned, _BEYOND), (rough_settings(settings), _BEYOND / 3)):
-                fit = refine(
-                    prepared.model,
-                    cleaned,
-                    prepared.wavefront,
-                    settings=each,
-                    start=prepared.options.start,
-                    progress=self.progress,
-                )
-                lights = light_from_beyond(fit.frames, whole, cut)
-                if not any(light.any() for light in lights):
-                    return cut
-                cleaned = tuple(
-                    replace(
-                        frame,
-                        data=frame.data - light,
-                        error=np.hypot(frame.error, error * light),
-                    )
-                    for frame, light in zip(cut, lights, strict=True)
-                )
-        return cleaned
 
-    def _untouched(self, science: Iterable[Observation]) -> tuple[Observation, ...]:
-        """Frames of the target with the light of all sources."""
-        return tuple(
-            replace(each, data=before.data, error=before.error)
-            for each, before in zip(science, self.preparation.sequence.science, strict=True)
-        )
+        def sources(science: tuple[Observation, ...]) -> tuple[list[Planet], list[Any]]:
+            fit = refine(
+                prepared.model,
+                science,
+                prepared.wavefront,
+                settings=aligned,
+                start=prepared.options.start,
+                progress=self.progress,
+            )
+            return sources_beyond(fit.frames, whole, cut)
+
+        with stage("bright sources beyond the fitted pixels"):
+            _, lights = sources(cut)
+            # Their light makes the star's flux wrong, and so their contrasts.
+            planets, _ = sources(
+                tuple(
+                    replace(each, data=each.data - light)
+                    for each, light in zip(cut, lights, strict=True)
+                )
+            )
+        for each in planets:
+            _log.warning(
+                "a bright source beyond the fitted pixels is fitted with the star: contrast %.2g, "
+                "%.2f arcsec from it",
+                each.contrast, each.separation,
+            )  # fmt: skip
+        return tuple(planets)
 
     @staticmethod
     def _has(injections: QTable | None, count: int) -> bool:
@@ -602,7 +595,7 @@ class _Run:
         if saved.origin != "library":
             known = saved.systematics or "off"
         choice = choose_systematics(
-            self._science,
+            self.preparation.sequence.science,
             (),
             self.preparation.model,
             self.preparation.wavefront,
@@ -621,6 +614,9 @@ class _Run:
     def _fit(self, science: Iterable[Observation], choice: PatternChoice) -> Refinement:
         """Fit the frames of the target; roughly, if reference stars are to join them."""
         options, settings = self.preparation.options, choice.settings
+        if self._beyond:
+            settings = settings or settings_for(choice.science[0])
+            settings = replace(settings, companions=(*settings.companions, *self._beyond))
         if self._joins_early(choice):
             settings = rough_settings(settings or settings_for(choice.science[0]))
         fit = refine(
