@@ -383,7 +383,10 @@ def has_bright_pixels_beyond(whole: Observation, cut: Observation) -> bool:
     image = np.where(valid, combined.data[0] - np.median(combined.data[0][valid]), 0.0)
     smooth = uniform_filter(image, 3)
     inside = _pixels_inside(whole, cut)
-    outside = smooth.copy()
+    x, y = np.indices(smooth.shape)[::-1] - whole.center[0][:, None, None]
+    scale_x, scale_y = whole.pixelscale
+    # Nearer to the star it is the brightest itself.
+    outside = np.where(np.hypot(scale_x * x, scale_y * y) > _CORE, smooth, 0.0)
     outside[inside] = 0.0
     return bool(outside[EDGE:-EDGE, EDGE:-EDGE].max(initial=0.0) > _SHARE * smooth[inside].max())
 

@@ -485,7 +485,7 @@ _SIMILAR = 1.5
 _PARTS = (1.0, 0.4, 0.16, 0.064)
 """Parts of an accurate step that are tried until one lowers the penalised chi-squared."""
 
-_SLOW = 0.6
+_SLOW = 0.8
 """Ratio of the gains of successive steps with the same derivatives above which they are poor: with
 right ones, gains decrease tenfold. Near a companion of 0.1 of the star's flux, whose light depends
 on the wavefront as well, each gain was 0.9 of the one before."""
