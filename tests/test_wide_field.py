@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import disk as module
-from pyklip_diffrender.detection import has_bright_pixels_beyond, sources_beyond, wide_field
+from pyklip_diffrender.detection import has_bright_pixels_beyond, wide_field
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -100,13 +100,7 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit():
     assert not has_bright_pixels_beyond(alone, before)
     assert has_bright_pixels_beyond(frame, cut)
     settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False)
-    fit = dr.refine(model(FITTED), cut, opd, settings=settings)
-    assert fit.chi2_per_pixel > 100
-    _, (light,) = sources_beyond(fit.frames, [frame], [cut])
-    assert np.std(light / cut.error[0]) > 20
-    left = (cut.data - before.data)[0] - light
-    assert np.std(left / np.hypot(cut.error[0], before.error[0])) < 1.5
-    assert not sources_beyond(fit.frames, [alone], [before])[0]
+    assert dr.refine(model(FITTED), cut, opd, settings=settings).chi2_per_pixel > 100
     whole, fitted = (Sequence("HD 1", (each,)) for each in (frame, cut))
     run = _Run(Preparation(whole, fitted, model(FITTED), opd, ReduceOptions(), settings), False)
     (known,) = run._beyond
