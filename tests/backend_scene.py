@@ -64,14 +64,11 @@ def generic(imgs, angles, wvs=None, **kw):
 
     n = len(imgs)
     return GenericData(
-        np.array(imgs),
-        np.tile(kw.pop("center", CENTER), (n, 1)),
+        np.array(imgs), np.tile(kw.pop("center", CENTER), (n, 1)),
         parangs=np.asarray(angles, dtype=float),
-        wvs=np.full(n, 4.44) if wvs is None else np.asarray(wvs),
-        IWA=3,
-        filenames=np.array([f"frame{i}" for i in range(n)]),
-        **kw,
-    )
+        wvs=np.full(n, 4.44) if wvs is None else np.asarray(wvs), IWA=3,
+        filenames=np.array([f"frame{i}" for i in range(n)]), **kw,
+    )  # fmt: skip
 
 
 def render(observation, opd, settings):

@@ -167,11 +167,9 @@ def test_zernikes_add_to_the_internal_wavefront(nircam):
 
 STEPS = {
     "opd": (torch.from_numpy(lopsided(NPIX, 4, 60e-9)), 1e-10),
-    "lyot_shift": ([0.0031, -0.0052], 1e-6),
-    "lyot_rotation": ([0.31], 1e-4),
-    "si_zernikes": (zernike_tensor(5), 1e-10),
-    "blur": ([0.02], 1e-4),
-}
+    "lyot_shift": ([0.0031, -0.0052], 1e-6), "lyot_rotation": ([0.31], 1e-4),
+    "si_zernikes": (zernike_tensor(5), 1e-10), "blur": ([0.02], 1e-4),
+}  # fmt: skip
 
 
 def test_gradients(nircam):

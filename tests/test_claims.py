@@ -1,8 +1,7 @@
 """Numbers of README, documentation and paper are those of the tables in ``docs/results``.
 
-A claim is a phrase with a place for each number. The numbers are looked up in the tables,
-formatted, and put into the phrase, which the document has to contain: the test fails if a number
-disagrees, and if the phrase is gone.
+A claim is a phrase with a place for each number, which the document has to contain with those
+of the tables: the test fails if a number disagrees, and if the phrase is gone.
 """
 
 import re

@@ -1,8 +1,6 @@
 """All work on an accelerator: nothing mixes devices, and the results are the processor's.
 
-The device is pretended, see `pretend_device`; ``python -m pytest -m gpu`` runs on a real one. What
-is computed takes the arguments of `model_on`, and returns arrays that do not depend on the device
-beyond rounding.
+The device is pretended, see `pretend_device`; ``python -m pytest -m gpu`` runs on a real one.
 """
 
 from dataclasses import replace
@@ -38,13 +36,9 @@ BASIS = FourierModes(2)
 PLANET = dr.Planet(1e-4, 0.5, 120.0)
 QUICK = {"free": ("star_offset", "flux", "background"), "max_iterations": 10}
 VALUES = {
-    "star_offset": (0.01, -0.02),
-    "lyot_shift": (0.002, 0.001),
-    "lyot_rotation": 0.3,
-    "detector_shift": (0.02, 0.01),
-    "blur": 0.03,
-    "si_zernikes": np.full(36, 2e-9),
-}
+    "star_offset": (0.01, -0.02), "lyot_shift": (0.002, 0.001), "lyot_rotation": 0.3,
+    "detector_shift": (0.02, 0.01), "blur": 0.03, "si_zernikes": np.full(36, 2e-9),
+}  # fmt: skip
 """Every parameter of the model, off its default."""
 
 

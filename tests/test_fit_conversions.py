@@ -1,9 +1,4 @@
-"""Frames made by the real stpsf and the real poppy, fitted with the models converted from them.
-
-What is simulated is no image of the package: the other code's own `calc_psf` makes it, from the
-user's object with the later wavefront in it, and the planet from the same object with its source
-moved.
-"""
+"""Frames that `calc_psf` of the real stpsf and poppy made, fitted with converted models."""
 
 from dataclasses import dataclass
 

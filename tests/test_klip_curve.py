@@ -58,12 +58,10 @@ def curve_of(science, references=(), separations=None, hidden=False, sources=Non
     """KLIP's curve for fitted frames, as if a search but where `hidden` had these `sources`."""
     curve = SimpleNamespace(meta={"resolution_arcsec": RESOLUTION})
     searched = SimpleNamespace(
-        fits=(SimpleNamespace(frames=tuple(science)),),
-        contrast_curve=curve,
-        grid=science[0].grid,
-        sources=Candidates.at([], []) if sources is None else sources,
+        fits=(SimpleNamespace(frames=tuple(science)),), contrast_curve=curve,
+        grid=science[0].grid, sources=Candidates.at([], []) if sources is None else sources,
         has_limits=~np.broadcast_to(hidden, science[0].grid.shape[:2]),
-    )
+    )  # fmt: skip
     return klip_curve(searched, [each.observation for each in references], separations)
 
 

@@ -21,14 +21,11 @@ def frame(k, rows, drift, first_mode):
     weight = 0.5 + random(NY, NX, seed=10 + k).abs()
     weight[1, 2] = 0.0
     return LinearFrame(
-        residual=torch.where(weight > 0, random(NY, NX, seed=20 + k), 0.0),
-        weight=weight,
-        jacobian=random(len(rows), NY, NX, seed=30 + k).float(),
-        rows=torch.tensor(rows),
-        drift=torch.tensor([drift], dtype=torch.int64),
-        first_mode=first_mode,
+        residual=torch.where(weight > 0, random(NY, NX, seed=20 + k), 0.0), weight=weight,
+        jacobian=random(len(rows), NY, NX, seed=30 + k).float(), rows=torch.tensor(rows),
+        drift=torch.tensor([drift], dtype=torch.int64), first_mode=first_mode,
         common=torch.zeros(NY, NX, dtype=torch.float64),
-    )
+    )  # fmt: skip
 
 
 def dense(model):

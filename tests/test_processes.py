@@ -31,10 +31,7 @@ assert threads == 1 and torch.get_num_threads() == 2
 def test_a_forked_child_computes_after_a_parent_with_two_threads():
     """Threads of the parent do not exist in the child, which would wait for them forever."""
     done = subprocess.run(
-        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", SCRIPT],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", SCRIPT], capture_output=True,
+        text=True, check=False, timeout=300,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr

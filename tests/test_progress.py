@@ -51,12 +51,9 @@ def test_the_log_gets_stages_and_at_most_a_line_a_minute(caplog, monkeypatch):
                 now += 1e-3
                 inner.update()
     assert [record.getMessage() for record in caplog.records] == [
-        "1. place on the detector",
-        "2. wavefront",
-        "2. wavefront, chi2 3, step 3",
-        "2. wavefront, chi2 3, step 6",
-        "2. wavefront, chi2 3, step 9",
-    ]
+        "1. place on the detector", "2. wavefront", "2. wavefront, chi2 3, step 3",
+        "2. wavefront, chi2 3, step 6", "2. wavefront, chi2 3, step 9",
+    ]  # fmt: skip
 
 
 def test_the_time_that_is_left_follows_the_stages_that_have_ended(caplog, monkeypatch):

@@ -36,14 +36,11 @@ def ours(occulter_sampling=None, route="auto"):
 
 def system(oversample):
     return reference.coronagraph(
-        jwst_pupil(NPIX).numpy(),
-        reference.lopsided_opd(NPIX),
+        jwst_pupil(NPIX).numpy(), reference.lopsided_opd(NPIX),
         polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy(),
-        reference.zernike_opd(reference.lopsided_zernikes(), NPIX),
-        oversample=oversample,
-        fov_pixels=80,
-        pixelscale=NIRCAM_LW_PIXELSCALE,
-    )
+        reference.zernike_opd(reference.lopsided_zernikes(), NPIX), oversample=oversample,
+        fov_pixels=80, pixelscale=NIRCAM_LW_PIXELSCALE,
+    )  # fmt: skip
 
 
 def theirs(oversample, separation):

@@ -157,13 +157,11 @@ def test_products_have_spaceklips_keywords_and_curves(tmp_path):
 def test_a_failure_is_reported_after_the_others(tmp_path, monkeypatch, caplog):
     good, bad = (concatenation([str(calints(tmp_path / f"{each}_calints.fits"))]) for each in "ab")
     obs = {
-        "bad": bad,
-        KEY: good,
-        "miri": concatenation(["c"], INSTRUME="MIRI", EXP_TYPE="MIR_4QPM"),
+        "bad": bad, KEY: good, "miri": concatenation(["c"], INSTRUME="MIRI", EXP_TYPE="MIR_4QPM"),
         "raw": concatenation(["d"], DATAMODL="STAGE1"),
         "references": concatenation(["e"], TYPE="REF"),
         "clear": concatenation(["f"], CORONMSK="NONE"),
-    }
+    }  # fmt: skip
     database = StandIn(tmp_path, obs)
 
     def reduced(key, table, judged, folder, *others):

@@ -96,9 +96,8 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit():
         dr.simulate(model(WHOLE), dr.Scene(STAR, planets=planets), opd, seed=5)
         for planets in ((), (source,))
     )
-    before, cut = alone.cutout(FITTED), frame.cutout(FITTED)
-    assert not has_bright_pixels_beyond(alone, before)
-    assert has_bright_pixels_beyond(frame, cut)
+    cut = frame.cutout(FITTED)
+    assert has_bright_pixels_beyond(frame, cut) > has_bright_pixels_beyond(alone, cut)
     settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False)
     assert dr.refine(model(FITTED), cut, opd, settings=settings).chi2_per_pixel > 100
     whole, fitted = (Sequence("HD 1", (each,)) for each in (frame, cut))
