@@ -106,6 +106,8 @@ def test_a_target_that_cannot_be_decided_is_an_error(tmp_path, arguments, words)
 def test_a_filter_is_needed_where_files_have_several(tmp_path):
     with pytest.raises(NoValidPixelsError, match="no FITS files"):
         Sequence.from_files(tmp_path)
+    with pytest.raises(IncompatibleSetupError, match="got a int, expected paths of FITS files"):
+        Sequence.from_files(3)
     for k, name in enumerate(("F356W", "F444W")):
         calints(tmp_path / f"{name}.fits", observation=k, cards={"FILTER": name})
     with pytest.raises(IncompatibleSetupError, match=r"filter: the files have .*F356W"):
