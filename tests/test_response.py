@@ -106,10 +106,10 @@ def test_wavefront_response_takes_the_field_of_the_star_it_is_asked_about():
 
 def test_responses_that_are_not_stored_are_the_same():
     """Room for one response: the other is computed again, about its own wavefront."""
-    model = system(npix=64)
-    start = downsample(OPD, 64)
-    basis = FourierModes(3)
+    model, start, basis = system(npix=64), downsample(OPD, 64), FourierModes(3)
     fields = model.fields(start, **VALUES)
+    last = ResponseCache(model, basis, npix=64).reading(is_last=True)
+    assert not last.near(start, VALUES).stored
     every = []
     for memory in (math.inf, 8 * len(basis) * 20 * 24, 100.0):
         responses = ResponseCache(model, basis, npix=64, keep=2, memory=memory)

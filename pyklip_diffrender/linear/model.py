@@ -215,7 +215,7 @@ class Noise:
         return torch.cat([each.flatten(1) for each in white.values()], dim=1)
 
     def at_pixels(self, pixels: Tensor) -> Noise:
-        """The same of some pixels only, indices (k,) into the flattened image: arrays are (k,)."""
+        """Noise of some pixels, indices (k,) into the flattened image; its arrays are (k,)."""
         return Noise(
             tuple(each.flatten()[pixels] for each in self.weight),
             tuple(each.flatten()[pixels] for each in self.common),
@@ -427,7 +427,7 @@ class LinearModel:
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def weigh_pixels(self, k: int, places: Tensor) -> TemplateProducts:
-        """The same as `weigh` for light in one pixel of frame k each, places (n, 2) as y, x."""
+        """Amplitudes of light in one pixel of frame k each, places (n, 2) as y, x; see `weigh`."""
         # Images of n single pixels would make all products with the Jacobian n times as long as
         # the n columns of it that they amount to.
         parts = []

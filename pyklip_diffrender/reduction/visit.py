@@ -319,12 +319,14 @@ def _aligned(
     for each in references:
         one = align_frame(fit, each, settings, systematics=pattern)
         brightness = one.frames[0].flux / fit.frames[0].flux
-        if brightness >= _FAINT and _unexplained(one) > limit:
+        unexplained = _unexplained(one)
+        if brightness >= _FAINT and unexplained > limit:
             each, one = _with_bright_companion(fit, each, one, settings, pattern, limit, remarks)
+            unexplained = _unexplained(one)
         reason = ""
         if brightness < _FAINT:
             reason = f"its star has {brightness:.2g} of the target's flux"
-        elif (unexplained := _unexplained(one)) > limit:
+        elif unexplained > limit:
             reason = (
                 f"with the target's wavefront, {100 * unexplained:.0f} % of its star's light is "
                 f"not explained, more than {100 * limit:.0f} %: another wavefront, or more than a "
@@ -469,7 +471,7 @@ def _gain(alone: Refinement, joint: Refinement) -> float:
 
 
 def _stated_gain(alone: Detection, joint: Detection) -> float:
-    """The same as `_gain` for limits as they are stated."""
+    """Stated limits of one search over those of another, in units of flux, the median."""
     curves = []
     for detection in (alone, joint):
         curve = detection.contrast_curve
@@ -498,7 +500,7 @@ def _contributions(
     left_out: dict[str, str],
     remarks: dict[str, str],
 ) -> tuple[Contribution, ...]:
-    """What every frame was used for."""
+    """Use of every frame of a reference star, and its share in the fit."""
     values, drifts = _frame_chi2(joint), _drifts(joint)
     places = {
         frame.observation.name: k

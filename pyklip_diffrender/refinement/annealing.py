@@ -717,7 +717,7 @@ class Annealing:
         return self.solver.posterior(end.state, priors)
 
     def _with_settings(self, end: _Fitted, settings: GaussNewton) -> _Fitted:
-        """The same state with other settings, and the priors that these state."""
+        """State of a fit with other settings, and the priors that these state."""
         carried = replace(end.carried, priors=self.solver.priors_of(settings))
         return replace(end, carried=carried, settings=settings)
 

@@ -93,7 +93,7 @@ class Job:
 
     @property
     def base_folder(self) -> str | None:
-        """The same of the job whose fit an injection starts from."""
+        """Folder of the job whose fit an injection starts from; None if it starts from none."""
         return None if self.base is None else folder_of(self.name, self.base)
 
     def __str__(self) -> str:
