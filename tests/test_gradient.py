@@ -9,11 +9,13 @@ import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.refinement.forward import Problem
+from pyklip_diffrender.refinement.forward import Forward, Problem
 from pyklip_diffrender.refinement.solver import (
+    FrameDerivatives,
     ModelDerivatives,
     Solver,
     StepState,
+    allowance,
     conjugate_gradients,
     linearise,
 )
@@ -143,7 +145,10 @@ def test_the_gradient_with_a_companion_is_that_of_chi_squared(contrast):
 
 
 def test_the_curvature_is_that_of_the_model_whatever_the_copy():
-    """Against the equations of a copy that is the model; those of a coarse one are far from it."""
+    """Against the equations of a copy that is the model; those of a coarse one are far from it.
+
+    The last curvature has the derivatives of the copy in the second frame.
+    """
     solver, state = solver_of(2)
     rng = np.random.default_rng(6)
     unit = units(solver, state)
@@ -152,12 +157,81 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy():
     for each in (solver, of_the_model_itself(solver)):
         weights = each.objective.errors(state, 0.01, 4.0)
         equations = linearise(each.objective, state, 0.01, len(BASIS), 4.0)
-        curved.append(unit * ModelDerivatives(each.objective, state, weights).product(step))
+        for rough in ({}, {1: equations.frames[1]}):
+            derivatives = ModelDerivatives(each.objective, state, weights, rough)
+            curved.append(unit * derivatives.product(step))
         products.append(unit * (equations.curvature @ step))
     coarse, expected = products
-    assert (curved[0] - expected).norm() < 2e-3 * expected.norm()
-    assert (curved[1] - expected).norm() < 2e-3 * expected.norm()
+    for k in (0, 2, 3):
+        assert (curved[k] - expected).norm() < 2e-3 * expected.norm()
     assert (coarse - expected).norm() > 0.1 * expected.norm()
+    assert (curved[1] - expected).norm() > 0.02 * expected.norm()
+
+
+def with_errors(equations, errors):
+    """Equations whose derivatives have other errors."""
+    each = zip(equations.derivatives, errors, strict=True)
+    return replace(equations, derivatives=tuple(replace(d, error=error) for d, error in each))
+
+
+def test_derivatives_at_the_same_state_are_used_again(monkeypatch):
+    """Those of each frame that are accurate enough, with new ones by companions."""
+    known, state = solver_of(2)
+    equations = known.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
+    companion = dr.Planet(3e-5, 0.4, 20.0)
+    later = known.objective.at(*state.unknowns.with_companions([companion], state.vector))
+    expected = linearise(known.objective, later, 0.01, len(BASIS), 4.0)
+    computed, compute = [], FrameDerivatives.at.__func__
+
+    def counted(cls, forward, *arguments):
+        computed.append(known.objective.forwards.index(forward))
+        return compute(cls, forward, *arguments)
+
+    monkeypatch.setattr(FrameDerivatives, "at", classmethod(counted))
+    for errors, expected_frames in (((0.03, 0.05), []), ((0.0, 0.06), [1])):
+        known.equations.last, computed[:] = with_errors(equations, errors), []
+        again = known.equations.about(later, 0.01, len(BASIS), 4.0, 0.05)
+        assert computed == expected_frames
+        assert again.derivatives[0].error == errors[0]
+        torch.testing.assert_close(again.curvature, expected.curvature)
+        torch.testing.assert_close(again.gradient, expected.gradient)
+    known.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
+    moved = known.objective.at(state.unknowns, 1.01 * state.vector)
+    computed.clear()
+    known.equations.about(moved, 0.01, len(BASIS), 4.0, 0.05)
+    assert computed == [0, 1]
+
+
+def test_frames_of_a_reference_star_may_have_rougher_derivatives():
+    """The target's may not."""
+    solver, state = solver_of(2)
+    equations = solver.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
+    target, reference = equations.derivatives
+    reference = replace(reference, allowance=0.05, error=0.04)
+    assert replace(equations, derivatives=(target, reference)).is_within(0.01)
+    assert not with_errors(equations, (0.04, 0.0)).is_within(0.01)
+    problem = replace(solver.objective.forwards[1].problem)
+    problem.observation = replace(problem.observation, reference=True)
+    assert allowance(Forward(problem, solver.objective.forwards[1].responses)) == 0.05
+    assert allowance(solver.objective.forwards[0]) == 0.0
+
+
+@pytest.mark.parametrize(("earlier", "is_slow"), [(1.1, True), (2.0, False), (0.9, False)])
+def test_slow_steps_are_followed_by_accurate_ones(earlier, is_slow):
+    """The gain is nearly that of the step before, with derivatives of another state."""
+    solver, state = solver_of(1, accurate_steps=True)
+    begun = StepState(solver.priors_of(solver.settings))
+
+    def step(carried):
+        solver.equations.last = None
+        equations = solver.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
+        solver.equations.last = with_errors(equations, (0.01,))
+        return solver._quick_step(state, carried, 0.01, len(BASIS), may_repeat=True)
+
+    _, gain, carried = step(begun)
+    assert gain > 0
+    assert not carried.needs_accurate
+    assert step(replace(begun, gain=earlier * gain))[2].needs_accurate == is_slow
 
 
 def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner():

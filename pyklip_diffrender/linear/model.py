@@ -109,15 +109,20 @@ class LinearFrame(FrameRows):
 
     def pulled(self, images: Tensor) -> Tensor:
         """Products of the derivatives with images, (k, ny, nx), in their precision: (rows, k)."""
-        # The rounding errors of single precision exceed the noise where a companion's light is 1e5
-        # standard deviations.
-        flat, columns = self.jacobian.flatten(1), images.flatten(1).T
-        if images.dtype == flat.dtype:
-            return flat @ columns
-        total = torch.zeros(len(flat), columns.shape[1], dtype=images.dtype)
-        for piece in pixel_pieces(len(columns)):
-            total += flat[:, piece].to(images.dtype) @ columns[piece]
-        return total
+        return _times_images(self.jacobian.flatten(1), images)
+
+
+def _times_images(rows: Tensor, images: Tensor) -> Tensor:
+    """Products of rows (n, pixels), float32, and images (k, ny, nx), in their precision: (n, k)."""
+    # The rounding errors of single precision exceed the noise where a companion's light is 1e5
+    # standard deviations.
+    columns = images.flatten(1).T
+    if images.dtype == rows.dtype:
+        return rows @ columns
+    total = torch.zeros(len(rows), columns.shape[1], dtype=images.dtype)
+    for piece in pixel_pieces(len(columns)):
+        total += rows[:, piece].to(images.dtype) @ columns[piece]
+    return total
 
 
 def pixel_pieces(pixels: int) -> list[slice]:
@@ -167,11 +172,11 @@ class Noise:
         products = [(w * c) ** 2 for w, c in zip(self.weight, self.common, strict=True)]
         return torch.stack(products).sum(dim=0)
 
-    def _summed(self, images: Mapping[int, Tensor]) -> Tensor:
-        """Sum of W c x over frames, for images x, (..., ny, nx)."""
+    def summed(self, images: Mapping[int, Tensor]) -> Tensor:
+        """Sum of W c x over frames, for images x, (..., ny, nx), in their precision."""
         total = torch.zeros_like(next(iter(images.values())))
         for k, image in images.items():
-            total += self.weight[k] ** 2 * self.common[k] * image
+            total += (self.weight[k] ** 2 * self.common[k]).to(image.dtype) * image
         return total
 
     def inverse(self, images: Mapping[int, Tensor]) -> dict[int, Tensor]:
@@ -183,7 +188,7 @@ class Noise:
         if not self.shares_pattern:
             return {k: self.weight[k].to(x.dtype) * x for k, x in images.items()}
         images = {k: x.double() for k, x in images.items()}
-        summed = self._summed(images)
+        summed = self.summed(images)
         return {
             k: weight * (images.get(k, torch.zeros(())) - common * summed)
             for k, (weight, common) in enumerate(zip(self.weight, self.common, strict=True))
@@ -206,7 +211,7 @@ class Noise:
             white = self.inverse(images)
         else:
             # (1 - a t t^T)^2 = 1 - t t^T = M^-1 with a = 1 / (1 + sqrt(1 - t^T t)).
-            summed = self._summed({k: x.double() for k, x in images.items()})
+            summed = self.summed({k: x.double() for k, x in images.items()})
             part = summed / (1 + torch.sqrt(1 - self._pattern_power))
             white = {
                 k: weight * (images.get(k, torch.zeros(())) - common * part)
@@ -221,11 +226,17 @@ class Noise:
             tuple(each.flatten()[pixels] for each in self.common),
         )
 
+    def power(self, images: Mapping[int, Tensor]) -> Tensor:
+        """x^T C^-1 x of images x, (k, ny, nx) by frame: (k,), float64."""
+        images = {k: x.double() for k, x in images.items()}
+        total = sum((self.weight[k] * x).square().sum(dim=(1, 2)) for k, x in images.items())
+        if self.shares_pattern:
+            total = total - self.summed(images).square().sum(dim=(1, 2))
+        return torch.as_tensor(total)
+
     def chi2(self, images: Sequence[Tensor]) -> float:
         """x^T C^-1 x of images x, (ny, nx), of all frames."""
-        by_frame = dict(enumerate(images))
-        total = sum(float(((self.weight[k] * x) ** 2).sum()) for k, x in by_frame.items())
-        return total - float((self._summed(by_frame) ** 2).sum()) if self.shares_pattern else total
+        return float(self.power({k: x[None] for k, x in enumerate(images)}))
 
 
 def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Iterator[Tensor]:
@@ -371,13 +382,26 @@ class LinearModel:
         )
         return tuple(whitened[k] for k in range(len(self.frames)))
 
+    @cached_property
+    def _pattern_rows(self) -> Tensor:
+        """R of the pattern that the frames share, (unknowns, pixels), float32."""
+        return torch.cat(list(summed_rows(self.frames, len(self.vector))), dim=1)
+
     def _pulled(self, images: Mapping[int, Tensor]) -> Tensor:
         """J C^-1 x of images x, (k, ny, nx) by frame, (unknowns, k), float64."""
+        # With C^-1 = W - W c c^T W and R = sum_f J_f W_f c_f over all frames,
+        #
+        #     J C^-1 x = sum_f J_f W_f x_f - R sum_f W_f c_f x_f,
+        #
+        # where only the frames that have light count in the sums over x.
         size = len(self.vector)
         total = torch.zeros(size, len(next(iter(images.values()))), dtype=torch.float64)
-        for k, weighted in self.noise.weighted(images).items():
+        for k, image in images.items():
             frame = self.frames[k]
+            weighted = frame.weight.square().to(image.dtype) * image
             total += frame.onto_unknowns(frame.pulled(weighted).double(), size)
+        if self.noise.shares_pattern:
+            total -= _times_images(self._pattern_rows, self.noise.summed(images)).double()
         return total
 
     def projected(self, templates: Mapping[int, Tensor]) -> Tensor:
@@ -422,7 +446,7 @@ class LinearModel:
             for k, images in part.items():
                 weighted = (images * self.frames[k].weight.to(images.dtype)).double()
                 numerator += torch.tensordot(weighted, self.cleaned[k], dims=2)
-            photon = (self.noise.whitened(part).double() ** 2).sum(dim=1)
+            photon = self.noise.power(part)
             parts.append(TemplateProducts(numerator, photon - absorbed, photon))
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
@@ -432,13 +456,14 @@ class LinearModel:
         # the n columns of it that they amount to.
         parts = []
         for some in (places @ torch.tensor([self.frames[k].weight.shape[1], 1])).split(_BATCH):
-            noise = self.noise.at_pixels(some)
-            pulled = torch.zeros(len(self.vector), len(some), dtype=torch.float64)
-            weighted = noise.weighted({k: torch.ones(len(some), dtype=torch.float64)})
-            for number, values in weighted.items():
-                frame = self.frames[number]
-                columns = frame.jacobian.flatten(1)[:, some].double().mul_(values)
-                pulled += frame.onto_unknowns(columns, len(self.vector))
+            noise, frame = self.noise.at_pixels(some), self.frames[k]
+            light = {k: torch.ones(len(some), dtype=torch.float64)}
+            weighted = noise.weighted(light)
+            # As in `_pulled`.
+            columns = frame.jacobian.flatten(1)[:, some].double().mul_(noise.weight[k].square())
+            pulled = frame.onto_unknowns(columns, len(self.vector))
+            if self.noise.shares_pattern:
+                pulled -= self._pattern_rows[:, some].double().mul_(noise.summed(light))
             absorbed = self._solved(pulled).square_().sum(dim=0)
             numerator = noise.weight[k] * self.cleaned[k].flatten()[some]
             parts.append(TemplateProducts(numerator, weighted[k] - absorbed, weighted[k]))

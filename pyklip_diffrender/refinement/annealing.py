@@ -31,9 +31,15 @@ from torch import Tensor
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.model import LinearModel, TemplateProducts, Unknown
 from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, Status, pixel_grid
-from pyklip_diffrender.refinement.forward import Objective, Problem, State
+from pyklip_diffrender.refinement.forward import Forward, Objective, Problem, State
 from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors, count_modes_below
-from pyklip_diffrender.refinement.solver import Solver, StepState
+from pyklip_diffrender.refinement.solver import (
+    FrameDerivatives,
+    Solver,
+    StepState,
+    allowance,
+)
+from pyklip_diffrender.refinement.unknowns import brightest
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.star_place import local_maxima
 from pyklip_diffrender.wavefront.bases import Basis
@@ -45,6 +51,7 @@ __all__ = [
     "Course",
     "bright_companions",
     "conclude",
+    "derivatives_of",
     "isolated_outliers",
     "with_dominant",
 ]
@@ -296,6 +303,32 @@ def _explained(products: TemplateProducts) -> Tensor:
 # The result of a fit: errors of the unknowns about its final state, and the images of the star.
 
 
+def derivatives_of(
+    fit: Refinement, forwards: Sequence[Forward], error: float
+) -> list[FrameDerivatives]:
+    """The derivatives of all frames about the final state of a fit, whose error is `error`."""
+    modes = len(fit.basis) if fit.settings.wavefront else 0
+    derivatives = []
+    for forward, frame, linear in zip(forwards, fit.frames, fit.linear.frames, strict=True):
+        sources = torch.from_numpy(fit.companions)
+        if frame.observation.reference:
+            sources = sources[:0]
+        allowed = allowance(forward)
+        derivatives.append(
+            FrameDerivatives(
+                jacobian=linear.jacobian,
+                modes=modes,
+                opd=torch.from_numpy(frame.opd).to(forward.model.device),
+                values={name: torch.as_tensor(v) for name, v in frame.values.items()},
+                sources=sources,
+                bright=len(brightest(sources)),
+                error=max(error, allowed),
+                allowance=allowed,
+            )
+        )
+    return derivatives
+
+
 def conclude(
     solver: Solver,
     settings: GaussNewton,
@@ -478,6 +511,7 @@ class Annealing:
     """One fit with a given basis.
 
     `warm` has the final values of an earlier fit; the wavefront is then free from the first step.
+    `earlier` is that fit if it was one of the same frames, whose derivatives are used again.
     """
 
     def __init__(
@@ -487,6 +521,7 @@ class Annealing:
         basis: Basis,
         warm: Mapping[Unknown, float] | None,
         progress: bool,
+        earlier: Refinement | None = None,
     ) -> None:
         self.settings, self.basis, self.progress = settings, basis, progress
         self.problems = list(problems)
@@ -500,6 +535,10 @@ class Annealing:
         )
         self._is_warm = warm is not None
         self.history: list[dict[str, Any]] = []
+        if earlier is not None and len(earlier.basis) == len(basis):
+            error = self.solver.allowed_error(final=True)
+            known = derivatives_of(earlier, self.objective.forwards, error)
+            self.solver.equations.start_from(known)
 
     def run(self) -> Refinement:
         """Fit the alignment, then alignment and wavefront; return the best iterate."""
@@ -812,8 +851,8 @@ class Annealing:
         Without it the star's flux would follow the companion's light.
         """
         error = self.objective.model_error(state)
-        is_fixed = self._is_warm or not self.settings.companions_if_stalled
-        if error < _OUTSHONE or is_fixed:
+        may_add = self.settings.companions_if_stalled or self.settings.max_companions > 0
+        if error < _OUTSHONE or self._is_warm or not may_add:
             return state, carried
         trial = with_dominant(self.objective, state, error)
         if trial is not state:

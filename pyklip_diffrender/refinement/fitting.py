@@ -89,16 +89,18 @@ def fit_in_stages(
     warm: Mapping[Unknown, float] | None = None,
     *,
     progress: bool,
+    same_frames: Refinement | None = None,
 ) -> Refinement:
     """Refine with the basis of the settings, or the first default basis that explains the data.
 
-    `problems` has one for each frame, and `warm` starting values. The `cycles` of the result's
-    settings begin with those of the last basis.
+    `problems` has one for each frame, and `warm` starting values. Derivatives of a fit of the
+    `same_frames` are used again. The `cycles` of the result's settings begin with those of the last
+    basis.
     """
     pupil = problems[0].model.entrance
     if settings.basis is not None or not settings.cycles:
         basis = settings.basis or default_basis(pupil=pupil)
-        return Annealing(problems, settings, basis, warm, progress).run()
+        return Annealing(problems, settings, basis, warm, progress, same_frames).run()
     # The number of modes that drift is fixed.
     grows = settings.wavefront and settings.grow_basis and settings.drift is None
     cycles_to_try = settings.cycles if grows else settings.cycles[:1]
@@ -108,8 +110,8 @@ def fit_in_stages(
         if fit is not None:
             _log.info("residuals have structure: adding modes up to %g cycles per pupil", cycles)
             adapted, warm = continue_from(fit, cycles=settings.cycles[k:])
-        earlier = fit
-        fit = Annealing(problems, adapted, default_basis(cycles, pupil), warm, progress).run()
+        earlier, basis = fit, default_basis(cycles, pupil)
+        fit = Annealing(problems, adapted, basis, warm, progress, same_frames).run()
         if earlier is not None:
             seconds, history = earlier.seconds + fit.seconds, earlier.history + fit.history
             fit = replace(fit, seconds=seconds, history=history)
@@ -130,7 +132,7 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
         for frame in fit.frames
     ]
     with breakdown_explained(problems[0].observation.name):
-        again = fit_in_stages(problems, settings, warm, progress=progress)
+        again = fit_in_stages(problems, settings, warm, progress=progress, same_frames=fit)
     return replace(again, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
 
 

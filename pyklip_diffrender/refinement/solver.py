@@ -28,7 +28,7 @@ from pyklip_diffrender.linear.model import (
     summed_rows,
 )
 from pyklip_diffrender.linear.response import Reading, ResponseCache
-from pyklip_diffrender.refinement.forward import Forward, Objective, Problem, State
+from pyklip_diffrender.refinement.forward import Forward, Objective, Point, Problem, State
 from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 from pyklip_diffrender.wavefront.bases import Basis
@@ -36,12 +36,14 @@ from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_eviden
 
 __all__ = [
     "EquationsCache",
+    "FrameDerivatives",
     "ModelDerivatives",
     "NormalEquations",
     "Solver",
     "Step",
     "StepState",
     "accurate_step",
+    "allowance",
     "conjugate_gradients",
     "first_unknowns",
     "linearise",
@@ -134,6 +136,76 @@ def _median_flux(problem: Problem, image: Tensor) -> float:
 
 
 @dataclass(frozen=True)
+class FrameDerivatives:
+    """Derivatives of the pixels of one frame, and where they were computed."""
+
+    jacobian: Tensor  # (rows, ny, nx), float32.
+    modes: int  # Number of leading modes that they are by.
+    opd: Tensor  # (npix, npix), m.
+    values: dict[str, Tensor]  # Of the parameters.
+    sources: Tensor  # (companions, 3), those that the frame shows.
+    bright: int  # Number of companions whose light counts in them, see `brightest`.
+    error: float  # Relative error, as that of a `Reading`.
+    allowance: float  # Error that is allowed in this frame, whatever it is in others.
+
+    @classmethod
+    def at(
+        cls,
+        forward: Forward,
+        point: Point,
+        modes: int,
+        outweighing: float = 0.0,
+        reading: Reading | None = None,
+    ) -> FrameDerivatives:
+        """Derivatives at a point, by its first `modes` modes.
+
+        The model error `outweighing` decides which companions count in them, see `brightest`, and
+        `reading` takes the derivatives of the field.
+        """
+        reading = forward.responses.reading() if reading is None else reading
+        unknowns, vector = point.unknowns, point.vector
+        return cls(
+            forward.jacobian(point, modes, outweighing, reading),
+            modes,
+            point.opd,
+            unknowns.values(vector),
+            unknowns.visible_sources(vector),
+            len(unknowns.bright_sources(vector, outweighing)),
+            reading.farthest,
+            allowance(forward),
+        )
+
+    def is_about(self, point: Point) -> bool:
+        """Whether they are those at a point, but for its companions."""
+        values = point.unknowns.values(point.vector)
+        return torch.equal(self.opd, point.opd) and all(
+            name in self.values and torch.equal(self.values[name], value)
+            for name, value in values.items()
+        )
+
+    def with_companions_of(self, forward: Forward, point: Point) -> FrameDerivatives:
+        """These derivatives, with those by the companions that the frame shows at a point."""
+        unknowns, vector = point.unknowns, point.vector
+        sources = unknowns.visible_sources(vector)
+        where = unknowns.where("companions")
+        after = self.modes + unknowns.amplitude_modes if self.modes else 0
+        known = slice(where.start, len(self.jacobian) - after)
+        if known == where and torch.equal(sources, self.sources):
+            return self
+        levels = forward.levels(point, sources[:0])
+        own = levels[len(levels) - (where.stop - where.start) :]
+        parts = (self.jacobian[: known.start], own, self.jacobian[known.stop :])
+        return replace(self, jacobian=torch.cat(parts), sources=sources)
+
+
+def allowance(forward: Forward) -> float:
+    """The error of a frame's derivatives that is allowed, whatever it is in others."""
+    # Limits for the target hardly depend on the derivatives of reference stars: with 0.05 they are
+    # the same to 4e-4 as with 0.01.
+    return _ACCURATE if forward.problem.observation.reference else 0.0
+
+
+@dataclass(frozen=True)
 class NormalEquations:
     """Normal equations of a state, for the unknowns minus their starting values."""
 
@@ -144,13 +216,27 @@ class NormalEquations:
     gradient: Tensor  # (unknowns,), g = J C^-1 r with the residual r at the starting values.
     current: Tensor  # (unknowns,), unknowns of the state minus their starting values.
     frames: tuple[LinearFrame, ...]
-    bright_companions: int  # Number of companions, over all frames, that count in the Jacobians.
-    # Largest error of the derivatives, as that of a `Reading`; in frames of reference stars over
-    # what is allowed there, times what is allowed in others.
-    error: float = 0.0
+    derivatives: tuple[FrameDerivatives, ...]
     # Whether curvature and gradient have the present weights of the pixels. If not, only the
     # Jacobians can be used again, and the curvature to precondition.
     has_weights: bool = True
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the derivatives are those of this state."""
+        return all(each.error == 0.0 for each in self.derivatives)
+
+    @property
+    def counts_companions(self) -> bool:
+        """Whether all companions count in the Jacobians whose light depends on the wavefront."""
+        return all(
+            each.bright == len(point.unknowns.bright_sources(point.vector))
+            for each, point in zip(self.derivatives, self.state.points, strict=True)
+        )
+
+    def is_within(self, error: float) -> bool:
+        """Whether the derivatives of all frames are accurate enough."""
+        return all(each.error <= max(error, each.allowance) for each in self.derivatives)
 
 
 _BLOCK = 256
@@ -191,17 +277,12 @@ def linearise(
     kappa: float,
     modes: int,
     robust: float,
-    jacobians: Sequence[Tensor] = (),
-    outweighing: float = 0.0,
-    reading: Reading | None = None,
-    of_references: Reading | None = None,
+    derive: Callable[[int], FrameDerivatives] | None = None,
 ) -> NormalEquations:
     """Linearise all frames about a state, with its first `modes` modes.
 
-    `jacobians` are those of all frames at this state, if they are known; otherwise `reading` takes
-    the derivatives of the field, and `of_references` those for frames of reference stars. The model
-    error `outweighing` decides which companions count in them, see `brightest`. A wavefront that
-    drifts between frames needs all modes.
+    `derive` gives the derivatives of a frame by its index, by default those at the state. A
+    wavefront that drifts between frames needs all modes.
     """
     size = state.unknowns.with_modes(modes)
     # S_f distributes the rows of frame f onto the unknowns: that of a leading mode to the shared
@@ -215,7 +296,8 @@ def linearise(
     current = (state.vector - state.unknowns.initial())[:size]
     curvature = torch.zeros(size, size, dtype=torch.float64)
     gradient = torch.zeros(size, dtype=torch.float64)
-    frames = []
+    frames: list[LinearFrame] = []
+    derivatives: list[FrameDerivatives] = []
     noise = objective.errors(state, kappa, robust)
     residuals = objective.residuals(state)
     whitened = noise.inverse(dict(enumerate(residuals)))
@@ -223,8 +305,9 @@ def linearise(
         residual, weight, common = (
             each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k])
         )
-        own = of_references if forward.problem.observation.reference else reading
-        rendered = jacobians[k] if jacobians else forward.jacobian(point, modes, outweighing, own)
+        derived = FrameDerivatives.at(forward, point, modes) if derive is None else derive(k)
+        derivatives.append(derived)
+        rendered = derived.jacobian
         part = state.unknowns.rows[k]
         rows, first = part.rows[: len(rendered)], part.first_mode
         drift = part.drift if modes else part.drift[:, :0]
@@ -248,9 +331,8 @@ def linearise(
         curvature = _mirror(torch.from_numpy(lower.T))
     gradient = gradient + curvature @ current
     return NormalEquations(
-        state, kappa, robust, curvature, gradient, current, tuple(frames),
-        state.bright_companions(outweighing),
-    )  # fmt: skip
+        state, kappa, robust, curvature, gradient, current, tuple(frames), tuple(derivatives)
+    )
 
 
 # Gauss-Newton steps with derivatives of the model itself, by conjugate gradients.
@@ -272,10 +354,20 @@ than the rounding errors of single precision."""
 
 
 class ModelDerivatives:
-    """Gradient and curvature of chi-squared, by derivatives of the model itself."""
+    """Gradient and curvature of chi-squared, by derivatives of the model itself.
 
-    def __init__(self, objective: Objective, state: State, noise: Noise) -> None:
+    The curvature has the approximate derivatives of the frames `rough`, by index.
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        state: State,
+        noise: Noise,
+        rough: Mapping[int, LinearFrame] | None = None,
+    ) -> None:
         self._objective, self._state, self._noise = objective, state, noise
+        self._rough = rough or {}
         self._levels = [
             forward.levels(point, point.unknowns.visible_sources(point.vector)).double()
             for forward, point in zip(objective.forwards, state.points, strict=True)
@@ -294,7 +386,7 @@ class ModelDerivatives:
     def gradient(self) -> Tensor:
         """Minus half the derivative of chi-squared, (unknowns,)."""
         sources = [point.unknowns.visible_sources(point.vector) for point in self._state.points]
-        return self._pull(dict(enumerate(self._objective.residuals(self._state))), sources)
+        return self._pull(dict(enumerate(self._objective.residuals(self._state))), sources, {})
 
     def product(self, step: Tensor) -> Tensor:
         """Product of the curvature with a step, (unknowns,)."""
@@ -302,6 +394,10 @@ class ModelDerivatives:
         # applies J C^-1 in reverse mode.
         vector, images, sources = self._state.vector + _DIFFERENCE * step, {}, []
         for k, before in enumerate(self._without_faint):
+            sources.append(before.unknowns.visible_sources(before.vector)[self._bright[k]])
+            if k in self._rough:
+                images[k] = self._rough[k].image(step).to(before.total.device)
+                continue
             rows, bright = self._state.unknowns.rows[k], self._bright[k]
             after = self._objective.forwards[k].at(
                 before.unknowns, rows.of_unknowns(vector), bright
@@ -309,8 +405,7 @@ class ModelDerivatives:
             images[k] = (after.total - before.total) / _DIFFERENCE
             if not bool(bright.all()):
                 images[k] = images[k] + self._change_of_faint(k, rows.of_unknowns(step))
-            sources.append(before.unknowns.visible_sources(before.vector)[bright])
-        return self._pull(images, sources)
+        return self._pull(images, sources, self._rough)
 
     def _change_of_faint(self, k: int, step: Tensor) -> Tensor:
         """Change of the light of faint companions in a frame by a step of its unknowns."""
@@ -324,10 +419,16 @@ class ModelDerivatives:
         relative = change_of_flux / unknowns.level("flux", point.vector)
         return relative * light + change.to(light.device)
 
-    def _pull(self, images: Mapping[int, Tensor], sources: Sequence[Tensor]) -> Tensor:
+    def _pull(
+        self,
+        images: Mapping[int, Tensor],
+        sources: Sequence[Tensor],
+        rough: Mapping[int, LinearFrame],
+    ) -> Tensor:
         """Product of the whitened Jacobian with images of all frames, which it whitens as well.
 
-        The Jacobian by optics and wavefront is that of the star and of `sources`, (k, 3) by frame.
+        The Jacobian by optics and wavefront is that of the star and of `sources`, (k, 3) by frame,
+        or that of a frame in `rough`.
         """
         objective, unknowns = self._objective, self._state.unknowns
         total = torch.zeros(unknowns.size, dtype=torch.float64)
@@ -338,6 +439,10 @@ class ModelDerivatives:
             # `inverse` has C^-1 x over w. Levels and companions have images in `_levels`, and the
             # derivatives by the other unknowns come from reverse mode.
             pixels = self._noise.weight[k] * whitened[k]
+            if k in rough:
+                on_rows = rough[k].pulled(pixels.cpu()[None])
+                total += rough[k].onto_unknowns(on_rows, unknowns.size)[:, 0]
+                continue
             where, levels = point.unknowns.slices, self._levels[k]
             of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
             last = where["companions"].stop
@@ -535,7 +640,12 @@ class EquationsCache:
         # computed. Its Jacobians are used again at the same state, and its curvature preconditions
         # accurate steps from states near it.
         self.last: NormalEquations | None = None
+        self._known: list[FrameDerivatives] = []
         self._preconditions = False
+
+    def start_from(self, derivatives: Sequence[FrameDerivatives]) -> None:
+        """Begin with derivatives of all frames from another fit."""
+        self._known = list(derivatives)
 
     def about(
         self,
@@ -552,34 +662,34 @@ class EquationsCache:
         Nothing is linearised after the equations that are `final`.
         """
         outweighing = 0.0 if final else kappa
-        bright = state.bright_companions(outweighing)
+        keep = len(state.points) + state.bright_companions(outweighing)
         # Jacobians do not depend on the weights of pixels, so that they stay right at the same
         # state.
-        last, keep = self.last, len(state.points) + bright
-        # Each response of the last reading is used once, and takes most of the memory.
-        reading = self._responses.reading(allowed, keep, is_last=final)
-        # Limits for the target hardly depend on the derivatives of reference stars: with 0.05 they
-        # are the same to 4e-4 as with 0.01.
-        rough = max(allowed, _ACCURATE)
-        of_references = self._responses.reading(rough, keep, is_last=final)
-        jacobians: list[Tensor] = []
-        error = None
-        if (
-            last is not None
-            and last.state is state
-            and last.error <= allowed
-            and len(last.current) == state.unknowns.with_modes(modes)
-            and last.bright_companions == bright
-        ):
-            jacobians, error = [frame.jacobian for frame in last.frames], last.error
-        last = self.last = None
-        equations = linearise(
-            self._objective, state, kappa, modes, robust, jacobians, outweighing,
-            reading, of_references,
-        )  # fmt: skip
-        if error is None:
-            error = max(reading.farthest, of_references.farthest * allowed / rough)
-        self.last = replace(equations, error=error)
+        known: list[FrameDerivatives | None] = list(self._known)
+        if self.last is not None:
+            known = list(self.last.derivatives)
+        self.last, self._known = None, []
+
+        def derive(k: int) -> FrameDerivatives:
+            forward, point = self._objective.forwards[k], state.points[k]
+            enough = max(allowed, allowance(forward))
+            bright = len(point.unknowns.bright_sources(point.vector, outweighing))
+            if known:
+                # It is freed before the new one, which is as large, is computed.
+                earlier, known[k] = known[k], None
+                if (
+                    earlier is not None
+                    and earlier.error <= enough
+                    and (earlier.modes, earlier.bright) == (modes, bright)
+                    and earlier.is_about(point)
+                ):
+                    return earlier.with_companions_of(forward, point)
+                del earlier
+            # Each response of the last reading is used once, and takes most of the memory.
+            reading = self._responses.reading(enough, keep, is_last=final)
+            return FrameDerivatives.at(forward, point, modes, outweighing, reading)
+
+        self.last = linearise(self._objective, state, kappa, modes, robust, derive)
         self._preconditions = True
         return self.last
 
@@ -590,7 +700,7 @@ class EquationsCache:
             last is not None
             and self._preconditions
             and (last.kappa <= _SIMILAR * kappa or not last.has_weights)
-            and last.error <= _ACCURATE
+            and last.is_within(_ACCURATE)
             and len(last.current) == state.unknowns.with_modes(modes)
         ):
             return last
@@ -699,7 +809,7 @@ class Solver:
             state, kappa, modes, objective.robust, self.settings.relinearise
         )
         # New derivatives that fail show that the model is not linear, as do large steps.
-        is_stale = may_repeat and equations.error > 0 and kappa < _FAR
+        is_stale = may_repeat and not equations.is_exact and kappa < _FAR
         noise = objective.errors(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else carried.damping
@@ -738,7 +848,6 @@ class Solver:
         objective = self.objective
         noise = objective.errors(state, kappa, objective.robust)
         before = self._cost(state, noise, carried.priors)
-        derivatives = ModelDerivatives(objective, state, noise)
         offset = state.vector - state.unknowns.initial()
         deviation = self.prior_deviation(state.unknowns, carried.priors)
         enough = self.settings.tolerance * objective.pixels / 2
@@ -748,6 +857,13 @@ class Solver:
             equations = None if is_new else self.equations.preconditioner(state, kappa, modes)
             if equations is None:
                 equations = self.equations.about(state, kappa, modes, objective.robust, _ACCURATE)
+            # Frames of reference stars, of which there may be many, hardly change the direction.
+            rough = {
+                k: equations.frames[k]
+                for k, forward in enumerate(objective.forwards)
+                if forward.problem.observation.reference
+            }
+            derivatives = ModelDerivatives(objective, state, noise, rough)
             step, settled = accurate_step(
                 derivatives, equations.curvature, offset, deviation, enough
             )
@@ -789,16 +905,15 @@ class Solver:
         """
         unknowns, equations = state.unknowns, self.equations.last
         count = unknowns.with_modes(modes)
-        allowed = _FINAL if final else _ACCURATE
-        allowed = allowed if self.settings.accurate_steps else self.settings.relinearise
+        allowed = self.allowed_error(final=final)
         if (
             equations is None
-            or equations.error > allowed
+            or not equations.is_within(allowed)
             or equations.state is not state
             or not equations.has_weights
             or (equations.kappa, equations.robust) != (kappa, robust)
             or len(equations.current) != count
-            or (final and equations.bright_companions != state.bright_companions())
+            or (final and not equations.counts_companions)
         ):
             del equations
             equations = self.equations.about(state, kappa, modes, robust, allowed, final=final)
@@ -810,6 +925,12 @@ class Solver:
             deviation=self.prior_deviation(unknowns, priors)[:count],
             curvature=equations.curvature,
         )
+
+    def allowed_error(self, *, final: bool) -> float:
+        """The error of the derivatives that linear models may have, see `linear_model`."""
+        if not self.settings.accurate_steps:
+            return self.settings.relinearise
+        return _FINAL if final else _ACCURATE
 
     def posterior(self, state: State, priors: ModePriors) -> EvidenceUpdate:
         """Return the errors of all unknowns of the last linear model, which is about `state`."""
