@@ -535,10 +535,14 @@ class Annealing:
         )
         self._is_warm = warm is not None
         self.history: list[dict[str, Any]] = []
+        # Whether the sizes of priors are known from these frames, and need not be measured again.
+        self._has_scales = False
         if earlier is not None and len(earlier.basis) == len(basis):
             error = self.solver.allowed_error(final=True)
             known = derivatives_of(earlier, self.objective.forwards, error)
             self.solver.equations.start_from(known)
+            widened = earlier.settings.widen_prior or not settings.widen_prior
+            self._has_scales = earlier.status.calibrated and widened
 
     def run(self) -> Refinement:
         """Fit the alignment, then alignment and wavefront; return the best iterate."""
@@ -548,7 +552,8 @@ class Annealing:
             while course.remaining and not converged:
                 gain = self._step(course)
                 bar.update(chi2=course.chi2)
-                if self._is_warm and len(self.history) == _EARLY:
+                may_measure = self._is_warm and not self._has_scales
+                if may_measure and len(self.history) == _EARLY:
                     end, _ = self._with_drift_of(self._end_of(course))
                     course.carried, course.settings = end.carried, end.settings
                 converged = (self._anneal if course.modes else self._align)(course, gain)
@@ -695,9 +700,9 @@ class Annealing:
     def _finish(self, best: _Fitted, converged: bool) -> tuple[_Fitted, Status]:
         """Correct what the residual of the best iterate shows to be wrong."""
         best = self._without_outliers(best)
-        if converged and self.settings.widen_prior:
-            best = self._with_wider_prior(best)
-        if converged:
+        if converged and not self._has_scales:
+            if self.settings.widen_prior:
+                best = self._with_wider_prior(best)
             best = self._with_measured_drift(best)
         if best.state.flux <= 0:
             return best, Status.DIVERGED
