@@ -176,58 +176,56 @@ def with_errors(equations, errors):
 
 def test_derivatives_at_the_same_state_are_used_again(monkeypatch):
     """Those of each frame that are accurate enough, with new ones by companions."""
-    known, state = solver_of(2)
-    equations = known.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
-    companion = dr.Planet(3e-5, 0.4, 20.0)
-    later = known.objective.at(*state.unknowns.with_companions([companion], state.vector))
-    expected = linearise(known.objective, later, 0.01, len(BASIS), 4.0)
+    solver, state = solver_of(2)
+    cache, arguments = solver.equations, (0.01, len(BASIS), 4.0)
+    equations = cache.about(state, *arguments, 0.05)
+    unknowns, vector = state.unknowns, state.vector
+    added = unknowns.with_companions([dr.Planet(3e-5, 0.4, 20.0)], vector)
+    later, moved = solver.objective.at(*added), solver.objective.at(unknowns, 1.01 * vector)
+    expected = linearise(solver.objective, later, *arguments)
     computed, compute = [], FrameDerivatives.at.__func__
 
-    def counted(cls, forward, *arguments):
-        computed.append(known.objective.forwards.index(forward))
-        return compute(cls, forward, *arguments)
+    def counted(cls, forward, *others):
+        computed.append(solver.objective.forwards.index(forward))
+        return compute(cls, forward, *others)
 
     monkeypatch.setattr(FrameDerivatives, "at", classmethod(counted))
-    for errors, expected_frames in (((0.03, 0.05), []), ((0.0, 0.06), [1])):
-        known.equations.last, computed[:] = with_errors(equations, errors), []
-        again = known.equations.about(later, 0.01, len(BASIS), 4.0, 0.05)
-        assert computed == expected_frames
+    for errors, new in (((0.03, 0.05), []), ((0.0, 0.06), [1])):
+        cache.last, computed[:] = with_errors(equations, errors), []
+        again = cache.about(later, *arguments, 0.05)
+        assert computed == new
         assert again.derivatives[0].error == errors[0]
         torch.testing.assert_close(again.curvature, expected.curvature)
         torch.testing.assert_close(again.gradient, expected.gradient)
-    known.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
-    moved = known.objective.at(state.unknowns, 1.01 * state.vector)
-    computed.clear()
-    known.equations.about(moved, 0.01, len(BASIS), 4.0, 0.05)
-    assert computed == [0, 1]
+    cache.about(moved, *arguments, 0.05)
+    assert computed == [1, 0, 1]
 
 
-def test_frames_of_a_reference_star_may_have_rougher_derivatives():
-    """The target's may not."""
+def test_only_frames_of_a_reference_star_may_have_rougher_derivatives():
     solver, state = solver_of(2)
-    equations = solver.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
-    target, reference = equations.derivatives
-    reference = replace(reference, allowance=0.05, error=0.04)
-    assert replace(equations, derivatives=(target, reference)).is_within(0.01)
-    assert not with_errors(equations, (0.04, 0.0)).is_within(0.01)
-    problem = replace(solver.objective.forwards[1].problem)
+    target, other = solver.equations.about(state, 0.01, len(BASIS), 4.0, 0.05).derivatives
+    forward = solver.objective.forwards[1]
+    problem = replace(forward.problem)
     problem.observation = replace(problem.observation, reference=True)
-    assert allowance(Forward(problem, solver.objective.forwards[1].responses)) == 0.05
-    assert allowance(solver.objective.forwards[0]) == 0.0
+    of_reference = allowance(Forward(problem, forward.responses))
+    assert (of_reference, allowance(forward)) == (0.05, 0.0)
+    rough = replace(solver.equations.last, derivatives=(target, replace(other, error=0.04)))
+    assert not rough.is_within(0.01)
+    reference = replace(rough.derivatives[1], allowance=of_reference)
+    assert replace(rough, derivatives=(target, reference)).is_within(0.01)
 
 
 @pytest.mark.parametrize(("earlier", "is_slow"), [(1.1, True), (2.0, False), (0.9, False)])
 def test_slow_steps_are_followed_by_accurate_ones(earlier, is_slow):
-    """The gain is nearly that of the step before, with derivatives of another state."""
+    """Their gain is nearly that of the step before, with derivatives of another state."""
     solver, state = solver_of(1, accurate_steps=True)
-    begun = StepState(solver.priors_of(solver.settings))
 
     def step(carried):
-        solver.equations.last = None
         equations = solver.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
         solver.equations.last = with_errors(equations, (0.01,))
         return solver._quick_step(state, carried, 0.01, len(BASIS), may_repeat=True)
 
+    begun = StepState(solver.priors_of(solver.settings))
     _, gain, carried = step(begun)
     assert gain > 0
     assert not carried.needs_accurate

@@ -149,7 +149,8 @@ class GaussNewton:
         in the orientation of the first frame.
     max_companions : int
         Largest number of companions that the fit may add if they are significant in the
-        residual of the alignment fit.
+        residual of the alignment fit. If it is not 0, a source that outshines what the mask leaves
+        of the star is looked for before that fit.
     companion_threshold : float
         Smallest S/N of such companions, in units of the scatter of the matched filter.
     companions_if_stalled : bool
