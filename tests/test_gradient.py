@@ -9,13 +9,11 @@ import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.refinement.forward import Forward, Problem
+from pyklip_diffrender.refinement.forward import Forward, FrameDerivatives, Problem, allowance
 from pyklip_diffrender.refinement.solver import (
-    FrameDerivatives,
     ModelDerivatives,
     Solver,
     StepState,
-    allowance,
     conjugate_gradients,
     linearise,
 )

@@ -31,14 +31,16 @@ from torch import Tensor
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.model import LinearModel, TemplateProducts, Unknown
 from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, Status, pixel_grid
-from pyklip_diffrender.refinement.forward import Forward, Objective, Problem, State
-from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors, count_modes_below
-from pyklip_diffrender.refinement.solver import (
+from pyklip_diffrender.refinement.forward import (
+    Forward,
     FrameDerivatives,
-    Solver,
-    StepState,
+    Objective,
+    Problem,
+    State,
     allowance,
 )
+from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors, count_modes_below
+from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.refinement.unknowns import brightest
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.star_place import local_maxima

@@ -27,8 +27,16 @@ from pyklip_diffrender.linear.model import (
     pixel_pieces,
     summed_rows,
 )
-from pyklip_diffrender.linear.response import Reading, ResponseCache
-from pyklip_diffrender.refinement.forward import Forward, Objective, Point, Problem, State
+from pyklip_diffrender.linear.response import ResponseCache
+from pyklip_diffrender.refinement.forward import (
+    ACCURATE,
+    Forward,
+    FrameDerivatives,
+    Objective,
+    Problem,
+    State,
+    allowance,
+)
 from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 from pyklip_diffrender.wavefront.bases import Basis
@@ -36,14 +44,12 @@ from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_eviden
 
 __all__ = [
     "EquationsCache",
-    "FrameDerivatives",
     "ModelDerivatives",
     "NormalEquations",
     "Solver",
     "Step",
     "StepState",
     "accurate_step",
-    "allowance",
     "conjugate_gradients",
     "first_unknowns",
     "linearise",
@@ -133,76 +139,6 @@ def _median_flux(problem: Problem, image: Tensor) -> float:
 
 
 # Normal equations of all frames about a state of the fit.
-
-
-@dataclass(frozen=True)
-class FrameDerivatives:
-    """Derivatives of the pixels of one frame, and where they were computed."""
-
-    jacobian: Tensor  # (rows, ny, nx), float32.
-    modes: int  # Number of leading modes that they are by.
-    opd: Tensor  # (npix, npix), m.
-    values: dict[str, Tensor]  # Of the parameters.
-    sources: Tensor  # (companions, 3), those that the frame shows.
-    bright: int  # Number of companions whose light counts in them, see `brightest`.
-    error: float  # Relative error, as that of a `Reading`.
-    allowance: float  # Error that is allowed in this frame, whatever it is in others.
-
-    @classmethod
-    def at(
-        cls,
-        forward: Forward,
-        point: Point,
-        modes: int,
-        outweighing: float = 0.0,
-        reading: Reading | None = None,
-    ) -> FrameDerivatives:
-        """Derivatives at a point, by its first `modes` modes.
-
-        The model error `outweighing` decides which companions count in them, see `brightest`, and
-        `reading` takes the derivatives of the field.
-        """
-        reading = forward.responses.reading() if reading is None else reading
-        unknowns, vector = point.unknowns, point.vector
-        return cls(
-            forward.jacobian(point, modes, outweighing, reading),
-            modes,
-            point.opd,
-            unknowns.values(vector),
-            unknowns.visible_sources(vector),
-            len(unknowns.bright_sources(vector, outweighing)),
-            reading.farthest,
-            allowance(forward),
-        )
-
-    def is_about(self, point: Point) -> bool:
-        """Whether they are those at a point, but for its companions."""
-        values = point.unknowns.values(point.vector)
-        return torch.equal(self.opd, point.opd) and all(
-            name in self.values and torch.equal(self.values[name], value)
-            for name, value in values.items()
-        )
-
-    def with_companions_of(self, forward: Forward, point: Point) -> FrameDerivatives:
-        """These derivatives, with those by the companions that the frame shows at a point."""
-        unknowns, vector = point.unknowns, point.vector
-        sources = unknowns.visible_sources(vector)
-        where = unknowns.where("companions")
-        after = self.modes + unknowns.amplitude_modes if self.modes else 0
-        known = slice(where.start, len(self.jacobian) - after)
-        if known == where and torch.equal(sources, self.sources):
-            return self
-        levels = forward.levels(point, sources[:0])
-        own = levels[len(levels) - (where.stop - where.start) :]
-        parts = (self.jacobian[: known.start], own, self.jacobian[known.stop :])
-        return replace(self, jacobian=torch.cat(parts), sources=sources)
-
-
-def allowance(forward: Forward) -> float:
-    """The error of a frame's derivatives that is allowed, whatever it is in others."""
-    # Limits for the target hardly depend on the derivatives of reference stars: with 0.05 they are
-    # the same to 4e-4 as with 0.01.
-    return _ACCURATE if forward.problem.observation.reference else 0.0
 
 
 @dataclass(frozen=True)
@@ -572,11 +508,6 @@ methods have similar limits (Nocedal and Wright 2006, Numerical Optimization, al
 _RESPONSES = 4e9
 """Largest number of bytes of stored derivatives."""
 
-_ACCURATE = 0.05
-"""Largest error of the derivatives that precondition accurate steps. Without these steps, fits
-of bright stars stopped at a chi-squared that was up to a fifth too large: along directions in which
-the effects of unknowns cancel, the curvature of the coarse copy was 20 times too small."""
-
 _FINAL = 0.01
 """Error of derivatives above which the linear model of such a fit gets new ones. With 0.05, limits
 were up to 10 % too shallow near the occulter."""
@@ -700,7 +631,7 @@ class EquationsCache:
             last is not None
             and self._preconditions
             and (last.kappa <= _SIMILAR * kappa or not last.has_weights)
-            and last.is_within(_ACCURATE)
+            and last.is_within(ACCURATE)
             and len(last.current) == state.unknowns.with_modes(modes)
         ):
             return last
@@ -856,7 +787,7 @@ class Solver:
         for is_new in (False, True):
             equations = None if is_new else self.equations.preconditioner(state, kappa, modes)
             if equations is None:
-                equations = self.equations.about(state, kappa, modes, objective.robust, _ACCURATE)
+                equations = self.equations.about(state, kappa, modes, objective.robust, ACCURATE)
             # Frames of reference stars, of which there may be many, hardly change the direction.
             rough = {
                 k: equations.frames[k]
@@ -930,7 +861,7 @@ class Solver:
         """The error of the derivatives that linear models may have, see `linear_model`."""
         if not self.settings.accurate_steps:
             return self.settings.relinearise
-        return _FINAL if final else _ACCURATE
+        return _FINAL if final else ACCURATE
 
     def posterior(self, state: State, priors: ModePriors) -> EvidenceUpdate:
         """Return the errors of all unknowns of the last linear model, which is about `state`."""
