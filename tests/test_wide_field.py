@@ -106,6 +106,10 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit():
     assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05
     fit = run._fit((cut,), choose_systematics((cut,), (), model(FITTED), opd, settings=settings))
     assert fit.companions[0, 0] == pytest.approx(3e-3, rel=0.01)
+    # Its light at the edges is that of pixels beyond them.
+    left_out = ~fit.frames[0].observation.valid[0]
+    assert left_out[:2].all()
+    assert not left_out[2:-2, 2:-2].any()
 
 
 @pytest.mark.slow

@@ -29,7 +29,11 @@ from pyklip_diffrender.detection.search import contrast_curve, detect, measure
 from pyklip_diffrender.detection.search_result import Detection, draw_curve
 from pyklip_diffrender.detection.sky_map import Hypotheses, Motion, SkyMap, hypotheses
 from pyklip_diffrender.detection.templates import combine_frames
-from pyklip_diffrender.detection.whole_frame import has_bright_pixels_beyond, sources_beyond
+from pyklip_diffrender.detection.whole_frame import (
+    has_bright_pixels_beyond,
+    sources_beyond,
+    without_border,
+)
 from pyklip_diffrender.detection.wide_search import WideField, require_outer_pixels, wide_field
 
 __all__ = [
@@ -63,4 +67,5 @@ __all__ = [
     "sources_of_references",
     "wide_field",
     "with_planets",
+    "without_border",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -32,7 +32,14 @@ from pyklip_diffrender.scene.observation import Observation
 if TYPE_CHECKING:
     from photutils.psf import ImagePSF
 
-__all__ = ["EDGE", "REACH", "WholeFrame", "has_bright_pixels_beyond", "sources_beyond"]
+__all__ = [
+    "EDGE",
+    "REACH",
+    "WholeFrame",
+    "has_bright_pixels_beyond",
+    "sources_beyond",
+    "without_border",
+]
 
 
 EDGE = 16
@@ -347,6 +354,10 @@ class WholeFrame:
 
 # Bright sources beyond the fitted pixels, whose light inside them would keep a fit from converging.
 
+_BORDER = 2
+"""Pixels at the edges of the fitted ones that are left out where a bright source is beyond them. A
+source of 0.01 of the star's flux at 3.2 arcsec left four false candidates there."""
+
 _SHARE = 0.2
 """Brightness of pixels beyond the fitted ones, relative to the brightest of these, from which there
 may be such a source. One of 1e-3 of the star's flux has about that in F444W."""
@@ -389,6 +400,16 @@ def has_bright_pixels_beyond(whole: Observation, cut: Observation) -> bool:
     outside = np.where(np.hypot(scale_x * x, scale_y * y) > _CORE, smooth, 0.0)
     outside[inside] = 0.0
     return bool(outside[EDGE:-EDGE, EDGE:-EDGE].max(initial=0.0) > _SHARE * smooth[inside].max())
+
+
+def without_border(cut: Observation) -> Observation:
+    """Frames without the pixels at the edges of their cutout, which light from beyond blurs into.
+
+    The model of a cutout has no light beyond its edges.
+    """
+    inner = np.zeros(cut.shape, dtype=bool)
+    inner[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
+    return replace(cut, valid=cut.valid & inner)
 
 
 def sources_beyond(

@@ -27,6 +27,7 @@ from pyklip_diffrender.detection import (
     require_outer_pixels,
     sources_beyond,
     wide_field,
+    without_border,
 )
 from pyklip_diffrender.errors import (
     DiffrenderError,
@@ -617,6 +618,7 @@ class _Run:
         if self._beyond:
             settings = settings or settings_for(choice.science[0])
             settings = replace(settings, companions=(*settings.companions, *self._beyond))
+            science = map(without_border, science)
         if self._joins_early(choice):
             settings = rough_settings(settings or settings_for(choice.science[0]))
         fit = refine(
