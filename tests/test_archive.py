@@ -181,12 +181,7 @@ def test_without_astroquery_the_message_says_what_to_install(monkeypatch):
     ("state", "options", "error", "message"),
     [
         ({}, {"program": "GTO"}, IncompatibleSetupError, "the number of a JWST programme"),
-        (
-            {},
-            {"target": "Vega"},
-            IncompatibleSetupError,
-            "target: got 'Vega', expected one of 'AU",
-        ),
+        ({}, {"target": "Vega"}, IncompatibleSetupError, "target: got 'Vega', expected one of 'AU"),
         ({}, {"filter": "F200W"}, IncompatibleSetupError, "filter: got 'F200W'"),
         ({"rows": []}, {}, ArchiveError, "no coronagraphic frames of NIRCam of programme 1184"),
         ({"failures": {"query": OFFLINE}}, {}, ArchiveError, "cannot be reached .*download the fi"),

@@ -94,9 +94,6 @@ def same(a, b):
     return a.keys() == b.keys() and all(a[key] is b[key] for key in a)
 
 
-# Registration
-
-
 def test_unregister_puts_back_the_same_objects():
     before = exchanged()
     assert not is_registered()
@@ -156,9 +153,6 @@ def test_other_algorithms_are_bit_identical(algo, imgs, tmp_path):
         for name, (data, header) in files.items():
             assert data.tobytes() == other_files[name][0].tobytes()
             assert repr(header) == repr(other_files[name][1])
-
-
-# What is left behind, against KLIP
 
 
 @pytest.mark.usefixtures("registered")
@@ -286,9 +280,6 @@ def test_high_pass_filter_acts_after_the_fit(highpass, imgs, tmp_path):
         reduced(copy.deepcopy(dataset), tmp_path / "c")
 
 
-# Where settings come from
-
-
 def test_block_wins_over_dataset_over_register(imgs, tmp_path, unregistered):
     def marked(n):
         def fake(observation, opd, settings):
@@ -392,9 +383,6 @@ def test_the_kinds_of_opd_and_their_provenance(kind, imgs, tmp_path):
     history = "".join(header["HISTORY"])
     assert "KL modes are all the same" in history
     assert "frames 0, 1" in history
-
-
-# Bad input and failures
 
 
 @pytest.mark.parametrize(
@@ -516,9 +504,6 @@ def test_every_wavelength_has_its_model(imgs, tmp_path):
     with backend(opd=OPD, model={4.0: "a", 4.4: "b"}, subtractor=fake):
         reduced(generic(imgs[:2], ANGLES[:2], wvs=[4.0, 4.4]), tmp_path)
     assert seen == ["a", "b"]
-
-
-# Observations
 
 
 def test_observation_from_a_dataset_without_headers(imgs):

@@ -120,8 +120,6 @@ def test_the_start_method_of_processes_changes_nothing(method, threads, rng, tmp
     np.testing.assert_array_equal(*cubes)
 
 
-# Calls in other threads and processes never run plain KLIP without a word.
-
 VARIABLE = "PYKLIP_DIFFRENDER_TAKES_KLIP"
 
 

@@ -52,9 +52,6 @@ def gathered(dataset, library=()):
     return frames_of(dataset, every, np.asarray(dataset.input), DiffrenderSettings(), library)
 
 
-# Which frames are which
-
-
 def test_rolls_are_pointings_with_the_headers_of_their_files(files):
     frames = gathered(JWSTData(files[:2]))
     assert [each.frames.tolist() for each in frames.pointings] == [[0, 1], [2, 3]]
@@ -216,9 +213,6 @@ def test_the_files_of_the_library_reach_the_fit(files, tmp_path, monkeypatch, ca
     assert "diffrender: at work\n" in capsys.readouterr().out
 
 
-# Which pattern is used
-
-
 def test_references_that_are_asked_for_must_be_there():
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
     light = 1000 * psf(15.5, 15.5, (32, 32))
@@ -229,9 +223,6 @@ def test_references_that_are_asked_for_must_be_there():
     settings = DiffrenderSettings(systematics="references", model=model)
     with pytest.raises(IncompatibleSetupError, match=r"psflib_filepaths after register\(\)"):
         subtract_by_refinement(frame, OPD, settings)
-
-
-# Which wavefront map is used
 
 
 @pytest.fixture
@@ -273,9 +264,6 @@ def test_a_map_needs_a_folder_and_the_frames_a_date(maps, files, tmp_path):
     register(opd_folder=maps)
     with pytest.raises(IncompatibleSetupError, match=r"after register\(\).*DATE-BEG"):
         reduce(undated, tmp_path / "out", mode="ADI")
-
-
-# What is checked before a fit
 
 
 @pytest.mark.parametrize(

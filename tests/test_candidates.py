@@ -119,8 +119,6 @@ def test_a_companion_that_outshines_the_star_is_fitted_with_it(caplog, changes):
     assert fit.model_error < 0.02
 
 
-# -- candidates beside a source that is nearer to the star than the search goes ---------------
-
 HIDDEN, PLANET, LOBE = (0.1, -0.08), (-0.3, 0.5), (0.22, 0.3)
 BESIDE = (0.34, -0.09)
 """The templates of this and of `HIDDEN` have a correlation of 0.48."""
@@ -190,8 +188,6 @@ def test_no_candidate_beside_a_planet_behind_the_mask():
     assert outcome.verdict == "fainter than the curve"
     assert np.isnan(outcome.pull)
 
-
-# -- errors of positions, which are measured from a star that is hidden behind the mask --------
 
 BRIGHT, FAINT = (0.45, 0.5), (-0.6, 0.2)
 PLACES = ((0.1, -0.7), FAINT)

@@ -53,8 +53,6 @@ def test_help(script, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("usage:")
 
 
-# -- the recipe of the paper, against which the experiments compare: Adam on the pixels of the map
-
 FLUX, BACKGROUND = 1e10, 500.0
 
 
@@ -148,9 +146,6 @@ def test_psnr_of_a_known_error():
     window = planet[7:18, 10:21]
     expected = 20 * math.log10(peak / (0.01 * math.sqrt((window**2).mean())))
     assert metrics.psnr(1.01 * planet, planet, PLANET) == pytest.approx(expected, abs=1e-9)
-
-
-# -- the demo ------------------------------------------------------------------------------------
 
 
 def test_references_are_nine_dithered_frames_of_the_reference_star():

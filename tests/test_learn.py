@@ -248,8 +248,6 @@ def test_real_stars_teach_the_pattern_of_another(shared_data):
         assert np.corrcoef(pattern.value[both], other.value[there][both])[0, 1] > 0.7
 
 
-# -- which pattern a target is fitted with: of the library, of other stars, or none ---------------
-
 COARSE = dr.random_opd(1, npix=64)
 LIBRARY = {"INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R"}
 SAME_FLAT = {**LIBRARY, "R_FLAT": "crds://jwst_nircam_flat_0465.fits"}

@@ -163,9 +163,6 @@ def test_a_wrong_number_of_planets_is_refused_before_anything_is_read(count):
         dr.reduce("no such folder", "no such map", injections=count)
 
 
-# -- completeness: the fraction of planets that a search finds ----------------------------------
-
-
 @cache
 def star_alone():
     """A star alone, of which the model is exact."""

@@ -36,14 +36,7 @@ def test_a_survey_runs_in_jobs_of_slurm(tmp_path, shared_data):
         [options]
         size = 24
         systematics = "off"
-        [options.settings]
-        cycles = [4.0]
-        max_iterations = 3
-        response_npix = 64
-        response_wavelengths = 1
-        accurate_steps = false
-        companions_if_stalled = false
-
+        settings = {{ cycles = [4.0], max_iterations = 3, accurate_steps = false }}
         [[sequence]]
         files = "{shared_data / "hip65426_f444w_calints.fits.gz"}"
         opd = "{shared_data / "opd_2022-07-30.fits.gz"}"
@@ -60,7 +53,6 @@ def test_a_survey_runs_in_jobs_of_slurm(tmp_path, shared_data):
     )  # fmt: skip
     logs = "\n".join(path.read_text() for path in tmp_path.glob("job-*.log"))
     assert done.returncode == 0, done.stderr + logs
-    # The work was done by a job, as the configuration describes it.
     (script,) = tmp_path.glob("job-*.sh")
     lines = script.read_text().splitlines()
     for line in ("#SBATCH -p standard", "#SBATCH -A my-project", "#SBATCH -t 04:00:00",

@@ -545,8 +545,6 @@ def test_files_with_and_without_a_planet(tmp_path):
         assert ("fit.fits" in products) == has_fit
 
 
-# Surveys as real processes that are killed, and inputs that are damaged.
-
 SCENARIOS = ("workers_killed", "full_disk", "damaged_inputs")
 BY_HAND = (
     "client_killed", "out_of_memory", "two_surveys", "scheduler_killed", "blind_worker",
@@ -559,8 +557,7 @@ are restarted without end. The others take long, and break the same code as thos
 @pytest.mark.slow
 @pytest.mark.hard
 @pytest.mark.parametrize(
-    "scenario",
-    [*SCENARIOS, *(pytest.param(name, marks=pytest.mark.study) for name in BY_HAND)],
+    "scenario", [*SCENARIOS, *(pytest.param(name, marks=pytest.mark.study) for name in BY_HAND)]
 )
 def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, monkeypatch):
     if scenario in (*SCENARIOS[:1], *BY_HAND[:5]):

@@ -30,8 +30,6 @@ def model(pixels=48):
     return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=pixels)
 
 
-# -- whole frames: rolls of a star with planets in and beyond the fit ----------------------------
-
 WHOLE, FITTED = 120, 48
 ROLLS = (20.0, 31.0)
 STAR = dr.Star(w2_magnitude=6.5, exposure=1800.0)
@@ -106,7 +104,6 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit():
     assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05
     fit = run._fit((cut,), choose_systematics((cut,), (), model(FITTED), opd, settings=settings))
     assert fit.companions[0, 0] == pytest.approx(3e-3, rel=0.01)
-    # Its light at the edges is that of pixels beyond them.
     left_out = ~fit.frames[0].observation.valid[0]
     assert left_out[:2].all()
     assert not left_out[2:-2, 2:-2].any()
@@ -240,8 +237,6 @@ def test_a_hot_pixel_is_no_source_and_a_source_no_hot_pixel(searched):
         sigma = WholeFrame(detection.fits[0].frames[0], each, 0.0).sigma
         assert np.argwhere(~np.isfinite(sigma)).tolist() == bad
 
-
-# -- extended light: two rolls of a star with a ring ---------------------------------------------
 
 ANGLES = (20.0, 32.0)
 HOST = dr.Star(w2_magnitude=5.5)

@@ -270,9 +270,6 @@ def test_extensions_in_any_order_or_missing(names, keep, path, truth):
         assert warned == ("DQ" not in names[:keep])
 
 
-# -- folders with random mutations: admitted rightly, excluded with a reason, or refused ---------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("real", "folders"), [(False, 15), (True, 5)], ids=["simulated", "real"])
 def test_no_folder_is_silently_wrong(tmp_path, real, folders, request):
