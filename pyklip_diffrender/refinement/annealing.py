@@ -323,7 +323,7 @@ def derivatives_of(
                 opd=torch.from_numpy(frame.opd).to(forward.model.device),
                 values={name: torch.as_tensor(v) for name, v in frame.values.items()},
                 sources=sources,
-                bright=len(brightest(sources)),
+                bright=brightest(sources),
                 error=max(error, allowed),
                 allowance=allowed,
             )

@@ -524,7 +524,7 @@ class FrameDerivatives:
     opd: Tensor  # (npix, npix), m.
     values: dict[str, Tensor]  # Of the parameters.
     sources: Tensor  # (companions, 3), those that the frame shows.
-    bright: int  # Number of companions whose light counts in them, see `brightest`.
+    bright: Tensor  # (k, 3), companions whose light counts in them, see `brightest`.
     error: float  # Relative error, as that of a `Reading`.
     allowance: float  # Error that is allowed in this frame, whatever it is in others.
 
@@ -550,17 +550,22 @@ class FrameDerivatives:
             point.opd,
             unknowns.values(vector),
             unknowns.visible_sources(vector),
-            len(unknowns.bright_sources(vector, outweighing)),
+            unknowns.bright_sources(vector, outweighing),
             reading.farthest,
             allowance(forward),
         )
 
-    def is_about(self, point: Point) -> bool:
-        """Whether they are those at a point, but for its companions."""
-        values = point.unknowns.values(point.vector)
-        return torch.equal(self.opd, point.opd) and all(
-            name in self.values and torch.equal(self.values[name], value)
-            for name, value in values.items()
+    def is_about(self, point: Point, modes: int, outweighing: float) -> bool:
+        """Whether they are those at a point, see `at`, but for its faint companions."""
+        unknowns, vector = point.unknowns, point.vector
+        return (
+            self.modes == modes
+            and torch.equal(self.opd, point.opd)
+            and torch.equal(self.bright, unknowns.bright_sources(vector, outweighing))
+            and all(
+                name in self.values and torch.equal(self.values[name], value)
+                for name, value in unknowns.values(vector).items()
+            )
         )
 
     def with_companions_of(self, forward: Forward, point: Point) -> FrameDerivatives:

@@ -166,7 +166,7 @@ class NormalEquations:
     def counts_companions(self) -> bool:
         """Whether all companions count in the Jacobians whose light depends on the wavefront."""
         return all(
-            each.bright == len(point.unknowns.bright_sources(point.vector))
+            torch.equal(each.bright, point.unknowns.bright_sources(point.vector))
             for each, point in zip(self.derivatives, self.state.points, strict=True)
         )
 
@@ -604,15 +604,13 @@ class EquationsCache:
         def derive(k: int) -> FrameDerivatives:
             forward, point = self._objective.forwards[k], state.points[k]
             enough = max(allowed, allowance(forward))
-            bright = len(point.unknowns.bright_sources(point.vector, outweighing))
             if known:
                 # It is freed before the new one, which is as large, is computed.
                 earlier, known[k] = known[k], None
                 if (
                     earlier is not None
                     and earlier.error <= enough
-                    and (earlier.modes, earlier.bright) == (modes, bright)
-                    and earlier.is_about(point)
+                    and earlier.is_about(point, modes, outweighing)
                 ):
                     return earlier.with_companions_of(forward, point)
                 del earlier
