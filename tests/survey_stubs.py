@@ -1,8 +1,26 @@
-"""Small inputs, configurations and cheap jobs for the tests of surveys."""
+"""Small inputs, configurations and cheap jobs for the tests of surveys; the tags of a page."""
 
-__all__ = ["HOSTILE", "configuration", "inputs", "result", "stub"]
+from html.parser import HTMLParser
+
+__all__ = ["HOSTILE", "Tags", "configuration", "inputs", "result", "stub"]
 
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>'
+
+
+class Tags(HTMLParser):
+    """All start tags of a page with their attributes, and its text outside the style sheet."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.words = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        if self.tags and self.tags[-1][0] != "style":
+            self.words.append(data)
 
 
 def inputs(folder, count=3):

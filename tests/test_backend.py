@@ -5,6 +5,7 @@ import ctypes
 import inspect
 import io
 import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -365,16 +366,11 @@ def test_klip_on_a_dataset_that_was_reduced_here_says_so_once(imgs, tmp_path, un
 def test_the_kinds_of_opd_and_their_provenance(kind, imgs, tmp_path):
     path = tmp_path / "R2022073003.fits"
     fits.PrimaryHDU(RIPPLE * 1e6, fits.Header({"BUNIT": "um"})).writeto(path)
-    seen = []
-
-    def fake(observation, opd, settings):
-        seen.append(np.asarray(opd))
-        return render(observation, opd, settings)
-
+    subtract = Mock(wraps=render)
     opd = str(path) if kind == "file" else RIPPLE * 1e9 * u.nm
-    with backend(opd=opd, subtractor=fake, filter="F444W"):
+    with backend(opd=opd, subtractor=subtract, filter="F444W"):
         _, header = reduced(generic(imgs, ANGLES), tmp_path / "out")[PRODUCT]
-    np.testing.assert_allclose(seen[0], RIPPLE, rtol=1e-12)
+    np.testing.assert_allclose(subtract.call_args.args[1], RIPPLE, rtol=1e-12)
     assert header["DROPD"] == ("array" if kind == "quantity" else path.name)
     assert len(header["DRSHA256"]) == 64
     assert (header["DRFILT"], header["DRSTAT"]) == ("F444W", "CONVERGED")
@@ -393,10 +389,7 @@ def test_the_kinds_of_opd_and_their_provenance(kind, imgs, tmp_path):
         ({}, {"mode": "RDI"}, ValueError, "psf_library"),
         ({}, {"numbasis": [1.5]}, TypeError, "integer"),
         ({}, {"annuli": 100}, ValueError, "Too many annuli"),
-        (
-            {"opd": None}, {}, MissingOPDError,
-            r"register\(opd=.*backend\(opd=.*DiffrenderSett",
-        ),
+        ({"opd": None}, {}, MissingOPDError, r"register\(opd=.*backend\(opd=.*DiffrenderSett"),
         ({"threads": 0}, {}, IncompatibleSetupError, "threads: got 0"),
         ({"image": "sharp"}, {}, IncompatibleSetupError, "image: got 'sharp'"),
         ({"subtractor": None}, {}, IncompatibleSetupError, "through which filter"),
@@ -495,15 +488,10 @@ def test_threads_and_errors_while_the_console_is_silenced(imgs, tmp_path, monkey
 
 
 def test_every_wavelength_has_its_model(imgs, tmp_path):
-    seen = []
-
-    def fake(observation, opd, settings):
-        seen.append(settings.model)
-        return render(observation, opd, settings)
-
-    with backend(opd=OPD, model={4.0: "a", 4.4: "b"}, subtractor=fake):
+    subtract = Mock(wraps=render)
+    with backend(opd=OPD, model={4.0: "a", 4.4: "b"}, subtractor=subtract):
         reduced(generic(imgs[:2], ANGLES[:2], wvs=[4.0, 4.4]), tmp_path)
-    assert seen == ["a", "b"]
+    assert [call.args[2].model for call in subtract.call_args_list] == ["a", "b"]
 
 
 def test_observation_from_a_dataset_without_headers(imgs):

@@ -228,6 +228,16 @@ def calls(monkeypatch):
     return begun
 
 
+def counting(function, calls, name):
+    """A function that also counts its calls."""
+
+    def counted(*args, **options):
+        calls[name] += 1
+        return function(*args, **options)
+
+    return counted
+
+
 def assert_same_call(one, other):
     assert_same_frames(one.science, other.science)
     assert one.settings == other.settings
@@ -274,7 +284,7 @@ def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, c
         monkeypatch.setattr(jobs, "sha256", lambda path: str(path))
         monkeypatch.setattr(execution, "sha256", lambda path: str(path))
     opened = Counter()
-    open_path, open_fits, judge = Path.open, fits.open, sequence.judge_frames
+    open_path, open_fits = Path.open, fits.open
 
     def count_path(path, *args, **options):
         opened[path.name] += 1
@@ -286,13 +296,9 @@ def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, c
             opened[Path(name).name] += 1
         return open_fits(name, *args, **options)
 
-    def count_judged(*args):
-        opened["judged"] += 1
-        judge(*args)
-
     monkeypatch.setattr(Path, "open", count_path)
     monkeypatch.setattr(fits, "open", count_open)
-    monkeypatch.setattr(sequence, "judge_frames", count_judged)
+    monkeypatch.setattr(sequence, "judge_frames", counting(sequence.judge_frames, opened, "judged"))
     with contextlib.suppress(Stopped, ExceptionGroup, DiffrenderError):
         door(files, tmp_path)
     assert len(calls) == 1
@@ -371,16 +377,6 @@ def assert_same(one, other):
 def answers():
     """The answer of `reduce`, once there is one."""
     return []
-
-
-def counting(function, calls, name):
-    """A function that also counts its calls."""
-
-    def counted(*args, **options):
-        calls[name] += 1
-        return function(*args, **options)
-
-    return counted
 
 
 @pytest.mark.slow

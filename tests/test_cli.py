@@ -383,20 +383,15 @@ def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
     assert "--resume keeps products" in capsys.readouterr().err
 
 
-def two_filters(folder):
-    """A folder with a frame of one star in each of two filters."""
-    frames = folder / "frames"
+@pytest.fixture
+def both_filters(tmp_path, maps):
+    """Arguments of a reduction of a folder with a frame of one star in each of two filters."""
+    frames = tmp_path / "frames"
     frames.mkdir()
     for name in ("F356W", "F444W"):
         write_frame(frames, name, TARGPROP="HIP-1", FILTER=name)
-    return frames
-
-
-@pytest.fixture
-def both_filters(tmp_path, maps):
-    """Arguments of a reduction in two filters."""
     options = ["--opd", str(maps), "-o", str(tmp_path / "products"), "--size", "8"]
-    return ["reduce", str(two_filters(tmp_path)), *options]
+    return ["reduce", str(frames), *options]
 
 
 def test_spectra_that_do_not_cover_a_filter_are_an_error_before_any_fit(

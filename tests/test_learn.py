@@ -212,12 +212,11 @@ def test_a_folder_of_libraries_is_a_choice_of_systematics(tmp_path):
     options = ReduceOptions(size=SIZE, systematics=tmp_path / "own")
     assert isinstance(options.systematics, dr.PatternLibrary)
     frame = observation(R_FLAT="new.fits")
-    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=SIZE)
-    chosen = choose_systematics([frame], [], model, OPD, systematics=options.systematics)
+    chosen = choose_systematics([frame], [], model(), OPD, systematics=options.systematics)
     assert chosen.label == "library (A, B)"
     # Where the folder has nothing, the package's library may have something.
     other = replace(observation(R_FLAT="jwst_nircam_flat_0465.fits"), first_pixel=(620, 1650))
-    chosen = choose_systematics([other], [], model, OPD, systematics=options.systematics)
+    chosen = choose_systematics([other], [], model(), OPD, systematics=options.systematics)
     assert chosen.label == "library (HIP17695, G-7-34)"
     check_settings(dr.DiffrenderSettings(systematics=tmp_path / "own"))
     with pytest.raises(errors.IncompatibleSetupError, match=r"systematics: got .*nowhere"):

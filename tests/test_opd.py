@@ -30,8 +30,6 @@ from pyklip_diffrender.wavefront import (
 )
 
 NPIX = 96
-
-
 PUPIL = jwst_pupil(NPIX).numpy() > 0.5
 OPD = random_opd(5, npix=NPIX).data
 OPD.setflags(write=False)

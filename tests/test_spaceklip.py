@@ -9,7 +9,6 @@ import pytest
 import torch
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
-from pyklip.instruments import JWST
 from small_files import calints as small_calints
 from synthetic_searches import searched
 
@@ -263,13 +262,8 @@ def real_database(tmp_path):
     return made
 
 
-def two_rolls(folder, monkeypatch):
+def two_rolls(folder):
     """Files of a star with a planet 0.8 arcsec from it at 120 degrees."""
-
-    def offline(**kw):
-        raise OSError("offline")
-
-    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", offline)
     model = nircam_coronagraph(
         "F444W", fov_pixels=SIDE, npix=128, occulter_sampling=2.0, monochromatic=4.44e-6
     )
@@ -286,9 +280,10 @@ def two_rolls(folder, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("offline")
 @pytest.mark.parametrize("kind", ["stand-in", "real"])
-def test_a_concatenation_from_frames_to_sources(kind, tmp_path, monkeypatch, request):
-    model, files = two_rolls(tmp_path, monkeypatch)
+def test_a_concatenation_from_frames_to_sources(kind, tmp_path, request):
+    model, files = two_rolls(tmp_path)
     sky = np.radians(120.0)
     real = kind == "real"
     database = request.getfixturevalue("real_database") if real else StandIn(tmp_path, {})
@@ -330,10 +325,11 @@ def test_a_flux_of_no_filter_is_refused(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("offline")
 def test_spaceklips_own_subtraction(tmp_path, monkeypatch, real_database):
     """`pyklippipeline.run_obs` with another algorithm; it does not run without references."""
     pipeline = pytest.importorskip("spaceKLIP.pyklippipeline", exc_type=ImportError)
-    model, files = two_rolls(tmp_path, monkeypatch)
+    model, files = two_rolls(tmp_path)
     table = concatenation(files)
     again = frame(tmp_path / "jw09_calints.fits", fits.getdata(files[0], "SCI")[0], 0.0)
     reference = concatenation([again])

@@ -176,16 +176,14 @@ def test_power_law_in_every_format(tmp_path, write, kind, filter):
     [
         ("<html>no</html>", CorruptFileError, "wavelength in micron and flux density in Jy"),
         ("3.0 -1\n4.0 nan\n5.0 0.5\n", CorruptFileError, "1 of 3 samples"),
-        (
-            "0.5 1.0\n1.5 0.5\n2.2 0.3\n",
-            IncompatibleSetupError, r"covers 0\.500 to 2\.200 micron",
-        ),
+        ("0.5 1.0\n1.5 0.5\n2.2 0.3\n", IncompatibleSetupError, r"covers 0\.500 to 2\.200 micron"),
         (
             "1.0 1.0\n2.0 0.5\n8.0 0.3\n",
-            IncompatibleSetupError, r"no sample between 2\.00 and 8\.00 micron",
+            IncompatibleSetupError,
+            r"no sample between 2\.00 and 8\.00 micron",
         ),
     ],
-)  # fmt: skip
+)
 def test_files_that_do_not_say_the_flux(tmp_path, text, expected, complaint):
     path = tmp_path / "star.txt"
     path.write_text(text)

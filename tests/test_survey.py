@@ -6,7 +6,6 @@ import sys
 from dataclasses import replace
 from datetime import date
 from functools import partial
-from html.parser import HTMLParser
 from math import inf
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
-from survey_stubs import HOSTILE, configuration, inputs, result, stub
+from survey_stubs import HOSTILE, Tags, configuration, inputs, result, stub
 from synthetic_searches import searched, write_searched
 
 import pyklip_diffrender as dr
@@ -348,15 +347,6 @@ def test_the_tables_say_the_same(tmp_path):
     assert rows[0]["peak_memory_bytes"] > 1e6
 
 
-def tags(text):
-    """Names of the tags of a page with their attributes."""
-    found = []
-    parser = HTMLParser()
-    parser.handle_starttag = lambda tag, attributes: found.append((tag, dict(attributes)))
-    parser.feed(text)
-    return found
-
-
 def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path, monkeypatch):
     monkeypatch.undo()  # With the picture.
     config = inputs(tmp_path / "data", 2)
@@ -373,10 +363,10 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path, monkeypa
     run_survey(config, output, work)
     text = (output / "survey.html").read_text(encoding="utf-8")
     assert text.count("&lt;script&gt;") > 8
-    assert not [each for tag, each in tags(text) if tag == "script" or "onerror" in each]
-    (picture,) = (each["src"] for tag, each in tags(text) if tag == "img")
+    assert not [each for tag, each in Tags(text).tags if tag == "script" or "onerror" in each]
+    (picture,) = (each["src"] for tag, each in Tags(text).tags if tag == "img")
     assert picture.startswith("data:image/png;base64,iVBOR")
-    links = [each["href"] for tag, each in tags(text) if tag == "a"]
+    links = [each["href"] for tag, each in Tags(text).tags if tag == "a"]
     assert links
     assert all((output / link).exists() for link in links)
 
@@ -420,10 +410,10 @@ def test_filters_of_a_star_are_searched_together_at_the_end(tmp_path, command, c
     section = text.partition("Filters and epochs together")[2].partition("</section>")[0]
     assert "MODEL_MISMATCH" in section
     assert "HD 2" not in section
-    (link,) = (each["href"] for tag, each in tags(section) if tag == "a")
+    (link,) = (each["href"] for tag, each in Tags(section).tags if tag == "a")
     page = folder / "comparison.html"
     assert (tmp_path / "out" / link).samefile(page)
-    links = [each["href"] for tag, each in tags(page.read_text(encoding="utf-8")) if tag == "a"]
+    links = [each.get("href", "") for _, each in Tags(page.read_text(encoding="utf-8")).tags]
     reports = [folder / each for each in links if "report.html" in each]
     assert len(reports) == 3
     assert all(each.exists() for each in reports)
