@@ -261,8 +261,8 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "outliers", "hot pixels are left out, planets are not",
-            "_explained(model, k, pixel) > _BETTER * _explained(model, k, sources).max()",
-            "_explained(model, k, pixel) < _BETTER * _explained(model, k, sources).max()",
+            "> _BETTER * _explained(model.weigh(sources)).max()",
+            "< _BETTER * _explained(model.weigh(sources)).max()",
             "outliers",
         ),
         Breakage(
