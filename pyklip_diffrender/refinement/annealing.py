@@ -861,6 +861,12 @@ class Annealing:
         may_add = self.settings.companions_if_stalled or self.settings.max_companions > 0
         if error < _OUTSHONE or self._is_warm or not may_add:
             return state, carried
+        # A star that is not aligned yet is as wrong.
+        steps = len(self.history)
+        alone, _ = self._settled(state, carried, _COMPANION_STEPS, modes=0)
+        if self.objective.model_error(alone) < _OUTSHONE:
+            del self.history[steps:]
+            return state, carried
         trial = with_dominant(self.objective, state, error)
         if trial is not state:
             trial, carried = self._settled(trial, carried, _COMPANION_STEPS, modes=0)
