@@ -15,7 +15,11 @@ from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import disk as module
-from pyklip_diffrender.detection import has_bright_pixels_beyond, wide_field
+from pyklip_diffrender.detection import (
+    has_bright_pixels_beyond,
+    wide_field,
+    without_blurred_edges,
+)
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -104,9 +108,25 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit():
     assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05
     fit = run._fit((cut,), choose_systematics((cut,), (), model(FITTED), opd, settings=settings))
     assert fit.companions[0, 0] == pytest.approx(3e-3, rel=0.01)
-    left_out = ~fit.frames[0].observation.valid[0]
-    assert left_out[:2].all()
-    assert not left_out[2:-2, 2:-2].any()
+
+
+def test_pixels_that_light_from_beyond_blurs_into_are_left_out():
+    opd = dr.random_opd(1, npix=128)
+    frame = dr.simulate(model(WHOLE), dr.Scene(STAR), opd, seed=5)
+    # A source just beyond the fitted pixels, which end at 1.5 arcsec.
+    light, of_cutout = (
+        4e6 * model(size)(opd, star_offset=(1.6, 0.3), blur=0.026).numpy()
+        for size in (WHOLE, FITTED)
+    )
+    whole = replace(frame, data=light[None])
+    cut, inside = whole.cutout(FITTED), np.s_[36:84, 36:84]
+    left_out = ~without_blurred_edges(whole, cut).valid[0]
+    wrong = np.abs(light[inside] - of_cutout) / cut.error[0]
+    assert (wrong > 0.8).sum() > 5
+    assert left_out[wrong > 0.8].all()
+    assert not left_out[wrong < 0.2].any()
+    # Nothing is known beyond the frame itself.
+    assert without_blurred_edges(cut, cut).valid.all()
 
 
 @pytest.mark.slow

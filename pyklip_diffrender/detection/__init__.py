@@ -32,7 +32,7 @@ from pyklip_diffrender.detection.templates import combine_frames
 from pyklip_diffrender.detection.whole_frame import (
     has_bright_pixels_beyond,
     sources_beyond,
-    without_border,
+    without_blurred_edges,
 )
 from pyklip_diffrender.detection.wide_search import WideField, require_outer_pixels, wide_field
 
@@ -67,5 +67,5 @@ __all__ = [
     "sources_of_references",
     "wide_field",
     "with_planets",
-    "without_border",
+    "without_blurred_edges",
 ]

@@ -17,6 +17,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, map_coordinates, uniform_filter
 from scipy.signal import fftconvolve
+from torch import Tensor
 
 from pyklip_diffrender.detection.field import (
     Image,
@@ -24,6 +25,8 @@ from pyklip_diffrender.detection.field import (
     separation_of,
 )
 from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.optics.planes import Detector
+from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.refinement.fit_result import pixel_grid
 from pyklip_diffrender.scene.objects import Planet
@@ -38,7 +41,7 @@ __all__ = [
     "WholeFrame",
     "has_bright_pixels_beyond",
     "sources_beyond",
-    "without_border",
+    "without_blurred_edges",
 ]
 
 
@@ -354,9 +357,10 @@ class WholeFrame:
 
 # Bright sources beyond the fitted pixels, whose light inside them would keep a fit from converging.
 
-_BORDER = 2
-"""Pixels at the edges of the fitted ones that are left out where a bright source is beyond them. A
-source of 0.01 of the star's flux at 3.2 arcsec left four false candidates there."""
+_WRONG = 0.5
+"""Error of the model at the edges of the fitted pixels, in standard deviations of the noise, above
+which a pixel is left out. A source of 0.01 of the star's flux at 3.2 arcsec left four false
+candidates there, and one of 0.1 at 1.5 arcsec residuals of four standard deviations."""
 
 _SHARE = 0.2
 """Brightness of pixels beyond the fitted ones, relative to the brightest of these, from which there
@@ -402,14 +406,33 @@ def has_bright_pixels_beyond(whole: Observation, cut: Observation) -> bool:
     return bool(outside[EDGE:-EDGE, EDGE:-EDGE].max(initial=0.0) > _SHARE * smooth[inside].max())
 
 
-def without_border(cut: Observation) -> Observation:
-    """Frames without the pixels at the edges of their cutout, which light from beyond blurs into.
+def without_blurred_edges(whole: Observation, cut: Observation) -> Observation:
+    """A cutout of a frame without pixels at its edges into which light from beyond them blurs.
 
-    The model of a cutout has no light beyond its edges.
+    The model of a cutout has no light beyond its edges, and is mirrored there before it is blurred.
     """
-    inner = np.zeros(cut.shape, dtype=bool)
-    inner[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
-    return replace(cut, valid=cut.valid & inner)
+    combined = whole.combined()
+    share = uniform_filter(combined.valid[0].astype(float), 3)
+    around = uniform_filter(np.where(combined.valid[0], combined.data[0], 0.0), 3)
+    around = np.divide(around, share, out=np.zeros_like(around), where=share > 0)
+    image = torch.from_numpy(np.where(combined.valid[0], combined.data[0], around))
+    sigma = torch.tensor([parameter("blur").start], dtype=image.dtype)
+
+    def blurred(pixels: Tensor) -> Image:
+        """Blurred, and mirrored at the edges."""
+        shape = (len(pixels), pixels.shape[1])
+        detector = Detector(shape, whole.pixelscale, 1, pixels.dtype, pixels.device)
+        return detector.image(pixels, {"blur": sigma}).numpy()
+
+    y, x = (each.start for each in _pixels_inside(whole, cut))
+    (ny, nx), (rows, columns) = cut.shape, whole.shape
+    # The cutout may reach beyond the frame, where it is masked.
+    inside = np.s_[max(y, 0) : min(y + ny, rows), max(x, 0) : min(x + nx, columns)]
+    difference = blurred(image)[inside] - blurred(image[inside])
+    wrong = np.zeros(cut.shape, dtype=bool)
+    within = np.s_[max(-y, 0) : min(rows - y, ny), max(-x, 0) : min(columns - x, nx)]
+    wrong[within] = np.abs(difference) > _WRONG * combined.error[0][inside]
+    return replace(cut, valid=cut.valid & ~wrong)
 
 
 def sources_beyond(

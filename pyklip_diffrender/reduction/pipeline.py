@@ -27,7 +27,7 @@ from pyklip_diffrender.detection import (
     require_outer_pixels,
     sources_beyond,
     wide_field,
-    without_border,
+    without_blurred_edges,
 )
 from pyklip_diffrender.errors import (
     DiffrenderError,
@@ -388,6 +388,14 @@ def prepare(
         cut = sequence.cutout(options.side)
     else:
         cut = sequence.cutout(model.detector.shape, beyond_edges=True)
+    science, references = (
+        tuple(map(without_blurred_edges, wholes, cuts))
+        for wholes, cuts in (
+            (sequence.science, cut.science),
+            (sequence.references, cut.references),
+        )
+    )
+    cut = replace(cut, science=science, references=references)
     if reference is not None:
         is_open = options.systematics == "auto"
         pattern = reference.pattern_for(cut.science[0]) if is_open else None
@@ -618,7 +626,6 @@ class _Run:
         if self._beyond:
             settings = settings or settings_for(choice.science[0])
             settings = replace(settings, companions=(*settings.companions, *self._beyond))
-            science = map(without_border, science)
         if self._joins_early(choice):
             settings = rough_settings(settings or settings_for(choice.science[0]))
         fit = refine(
