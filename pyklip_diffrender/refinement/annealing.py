@@ -429,7 +429,8 @@ planet of contrast 1e-4 at 0.3 arcsec were mistaken for planets at 0.005 to 0.1.
 _BRIGHT = 8.0
 """S/N of a companion, in units of the scatter, that is added when the fit of the wavefront stalls.
 
-Without companions, peaks reached 6 (drifts of 40 to 400 h); companions that stalled a fit had 12.
+Without companions, peaks reached 6 (drifts of 40 to 400 h), and 7 in aligned real frames.
+Companions that stalled a fit had 12, and two neighbours of 1e-3 of the star's flux 34 and 17.
 """
 
 _FAINT = 5.0
@@ -838,6 +839,11 @@ class Annealing:
         fine = kappa <= max(_COARSE, self.settings.min_model_error)
         return self._few_modes if coarse and not fine else len(self.basis)
 
+    @property
+    def _may_add(self) -> bool:
+        """Whether sources that nothing else explains may become companions of the fit."""
+        return self.settings.companions_if_stalled or self.settings.max_companions > 0
+
     def _room(self, course: Course) -> int:
         """Number of companions that may still be added."""
         return self.settings.max_companions - len(course.state.unknowns.frames[0].companions)
@@ -845,7 +851,7 @@ class Annealing:
     def _significant(self, course: Course) -> list[Planet]:
         """Companions in the residual of the alignment."""
         most, threshold = self._room(course), self.settings.companion_threshold
-        if most < 1 and self.settings.companions_if_stalled and self.settings.wavefront:
+        if most < 1 and self._may_add and self.settings.wavefront:
             # Brighter than all that the wavefront can have left.
             most, threshold = min(1, most + _MOST_BRIGHT), _BRIGHT
         return bright_companions(
@@ -858,8 +864,7 @@ class Annealing:
         Without it the star's flux would follow the companion's light.
         """
         error = self.objective.model_error(state)
-        may_add = self.settings.companions_if_stalled or self.settings.max_companions > 0
-        if error < _OUTSHONE or self._is_warm or not may_add:
+        if error < _OUTSHONE or self._is_warm or not self._may_add:
             return state, carried
         # A star that is not aligned yet is as wrong.
         steps = len(self.history)
