@@ -80,12 +80,12 @@ def test_a_planet_that_ends_a_fit_at_a_wrong_wavefront_is_found(seed, cycles):
     assert abs(outcome.pull) < 4
 
 
-def changed(share, planet):
-    """A model, a map, and a frame of a planet under a wavefront that has changed."""
+def changed(share, *planets):
+    """A model, a map, and a frame of planets under a wavefront that has changed."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)
     before, change = (dr.random_opd(k, npix=128) for k in (8, 9))
     now = replace(before, data=before.data + share * change.data)
-    return model, dr.simulate(model, dr.Scene(planets=(planet,)), now, seed=5), before, now
+    return model, dr.simulate(model, dr.Scene(planets=planets), now, seed=5), before, now
 
 
 @pytest.mark.slow
@@ -118,6 +118,16 @@ def test_a_companion_that_outshines_the_star_is_fitted_with_it(caplog, changes):
     assert companion[0] == pytest.approx(planet.contrast, rel=0.03)
     assert companion[1:] == pytest.approx(planet.offset, abs=0.002)
     assert fit.model_error < 0.02
+
+
+@pytest.mark.slow
+def test_bright_neighbours_are_companions_of_a_fit():
+    """One may be faint, and others are too bright for the wavefront to have left them."""
+    *given, _ = changed(0.1, dr.Planet(5e-3, 0.6, 70.0), dr.Planet(3e-3, 0.7, 250.0))
+    fit = dr.refine(*given, settings=dr.GaussNewton(
+        cycles=3, max_iterations=6, max_companions=1, companions_if_stalled=False,
+    ))  # fmt: skip
+    assert sorted(fit.companions[:, 0]) == pytest.approx([3e-3, 5e-3], rel=0.05)
 
 
 HIDDEN, PLANET, LOBE = (0.1, -0.08), (-0.3, 0.5), (0.22, 0.3)
