@@ -25,8 +25,9 @@ from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pattern import choose_systematics
 from pyklip_diffrender.reduction import ReduceOptions
-from pyklip_diffrender.reduction.pipeline import Preparation, _Run
+from pyklip_diffrender.reduction.pipeline import Preparation, _Run, prepare
 from pyklip_diffrender.scene import Sequence
+from pyklip_diffrender.scene.observation import Window
 from pyklip_diffrender.wavefront import random_drift
 
 
@@ -127,6 +128,10 @@ def test_pixels_that_light_from_beyond_blurs_into_are_left_out():
     assert not left_out[wrong < 0.2].any()
     # Nothing is known beyond the frame itself.
     assert without_blurred_edges(cut, cut).valid.all()
+    larger = cut.within(Window(-4, -4, (FITTED + 8, FITTED + 8)))
+    assert (without_blurred_edges(cut, larger).valid == larger.valid).all()
+    prepared = prepare(Sequence("HD 1", (whole,)), opd, ReduceOptions(), model=model(FITTED))
+    assert (prepared.sequence.science[0].valid[0] == ~left_out).all()
 
 
 @pytest.mark.slow

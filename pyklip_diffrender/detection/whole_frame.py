@@ -412,6 +412,7 @@ def without_blurred_edges(whole: Observation, cut: Observation) -> Observation:
     The model of a cutout has no light beyond its edges, and is mirrored there before it is blurred.
     """
     combined = whole.combined()
+    # Pixels that are not valid have the mean of those beside them.
     share = uniform_filter(combined.valid[0].astype(float), 3)
     around = uniform_filter(np.where(combined.valid[0], combined.data[0], 0.0), 3)
     around = np.divide(around, share, out=np.zeros_like(around), where=share > 0)
@@ -420,8 +421,8 @@ def without_blurred_edges(whole: Observation, cut: Observation) -> Observation:
 
     def blurred(pixels: Tensor) -> Image:
         """Blurred, and mirrored at the edges."""
-        shape = (len(pixels), pixels.shape[1])
-        detector = Detector(shape, whole.pixelscale, 1, pixels.dtype, pixels.device)
+        ny, nx = pixels.shape
+        detector = Detector((ny, nx), whole.pixelscale, 1, pixels.dtype, pixels.device)
         return detector.image(pixels, {"blur": sigma}).numpy()
 
     y, x = (each.start for each in _pixels_inside(whole, cut))
