@@ -13,8 +13,8 @@ to twice as bright as the target; some have another spectral type, a companion, 
 their header says.
 
 Writes ``visits.ecsv`` with a row for every visit: planets that were found and missed, false
-candidates, pulls, scatter of the S/N before it is scaled, and limits over those of a fit without
-references.
+candidates, pulls, scatter of the S/N before it is scaled, the star's flux over the true one, and
+limits over those of a fit without references, in units of flux.
 """
 
 from __future__ import annotations
@@ -172,12 +172,13 @@ def reduced(visit: Visit, folder: Path) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     before = write_frames(visit, folder)
     sequence = Sequence.from_files(folder / "frames", target="HD 1")
-    size, seconds, results = visit.case.size, {}, {}
+    size, seconds, results, stars = visit.case.size, {}, {}, {}
     for use in ("joint", "off"):
         began = time.process_time()
         reduction = dr.reduce(sequence, before, size=size, references=use)
         seconds[use] = time.process_time() - began
         results[use] = made.compare(visit.case, reduction)
+        stars[use] = reduction.fit.frames[0].flux / visit.case.flux
         if use == "joint":
             used = [each.use == "joint" for each in reduction.visit.contributions]
             remarks = "; ".join(
@@ -186,6 +187,7 @@ def reduced(visit: Visit, folder: Path) -> dict[str, Any]:
     joint, alone = results["joint"], results["off"]
     planets = [each for each in joint["planets"] if "snr" in each]
     ratio = np.array(alone["limits"]) / np.array(joint["limits"])
+    ratio *= stars["off"] / stars["joint"]
     result = {
         "visit": visit.number, "filter": visit.case.filter, "mask": visit.case.mask,
         "drift_nm": 1e9 * visit.drift, "brightness": visit.brightness, "dithers": visit.dithers,
@@ -198,8 +200,11 @@ def reduced(visit: Visit, folder: Path) -> dict[str, Any]:
         "scatter": joint["snr_scatter"], "factor": joint["error_factor"],
         "deeper": float(np.median(ratio)), "deeper_least": float(np.min(ratio)),
         "over_known": joint["limits_over_known_star"],
-        "pulls": [each[name] for each in planets
-                  for name in ("flux_pull", "separation_pull", "angle_pull")],
+        "star": stars["joint"], "star_alone": stars["off"],
+        # With the S/N as the error of a flux, which does not contain that of the star's.
+        "pulls": [value for each in planets
+                  for value in (each["flux_pull"], each["separation_pull"], each["angle_pull"],
+                                each["snr"] * (1 - 1 / (each["ratio"] * stars["joint"])))],
         "cpu": seconds["joint"], "cpu_alone": seconds["off"], "remarks": remarks,
     }  # fmt: skip
     done.write_text(json.dumps(result, indent=2), encoding="utf-8")
@@ -233,9 +238,13 @@ def main() -> None:
             print({k: v for k, v in result.items() if k != "pulls"}, flush=True)
     whole = [row for row in rows if "chi2" in row]
     table = Table({name: [row[name] for row in whole] for name in whole[0] if name != "pulls"})
-    pulls = np.array([pull for row in whole for pull in row["pulls"]]).reshape(-1, 3)
+    pulls = np.array([pull for row in whole for pull in row["pulls"]]).reshape(-1, 4)
     table.meta["pulls_rms"] = dict(
-        zip(("flux", "separation", "angle"), np.sqrt((pulls**2).mean(axis=0)).tolist(), strict=True)
+        zip(
+            ("contrast", "separation", "angle", "flux"),
+            np.sqrt((pulls**2).mean(axis=0)).tolist(),
+            strict=True,
+        )
     )
     table.write(options.output / "visits.ecsv", overwrite=True)
     print(table.meta["pulls_rms"], len(pulls))

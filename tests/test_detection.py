@@ -122,7 +122,7 @@ def test_a_prior_that_is_held_too_narrow_is_widened(world):
     assert not likely.prior_ratios
     narrow = {name: scale / 3 for name, scale in likely.scales.items()}
     held = WavefrontPrior(narrow, fit_scales=False)
-    fit = world.refined(observation, prior=held, widen_prior=True)
+    fit = world.refined(observation, prior=held, adapt_prior=True)
     assert fit.status is Status.CONVERGED
     # Too few modes of the texture are determined.
     assert fit.scales["segment"] == pytest.approx(likely.scales["segment"], rel=0.15)
@@ -136,7 +136,7 @@ def test_a_prior_that_is_held_too_narrow_is_widened(world):
     assert len(fit.history) > len(unwidened.history)
     # A prior that holds is left alone.
     right = WavefrontPrior(likely.scales, fit_scales=False)
-    kept = world.refined(observation, prior=right, widen_prior=True)
+    kept = world.refined(observation, prior=right, adapt_prior=True)
     assert kept.status is Status.CONVERGED
     assert kept.scales == pytest.approx(likely.scales)
 
@@ -150,7 +150,7 @@ def test_the_prior_of_the_amplitude_is_widened_as_well(world):
         amplitude_cycles=4.0, amplitude_scale=2.0, amplitude_slope=0.0,
     )  # fmt: skip
     before, fit = (
-        world.refined(observation, prior=narrow, widen_prior=each) for each in (False, True)
+        world.refined(observation, prior=narrow, adapt_prior=each) for each in (False, True)
     )
     assert before.status is Status.PRIOR_MISMATCH
     assert before.prior_ratios["amplitude"] > 3

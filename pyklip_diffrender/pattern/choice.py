@@ -166,7 +166,7 @@ pattern's own error is counted apart."""
 _ROUGH: dict[str, Any] = {
     "min_model_error": 0.05,
     "tolerance": 0.05,
-    "widen_prior": False,
+    "adapt_prior": False,
     "grow_basis": False,
     "coarse_first": False,
     "companions_if_stalled": False,

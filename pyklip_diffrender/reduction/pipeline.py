@@ -675,7 +675,7 @@ class _Run:
                 whole = refine_again(
                     fit,
                     tolerance=full.tolerance,
-                    widen_prior=full.widen_prior,
+                    adapt_prior=full.adapt_prior,
                     progress=self.progress,
                 )
             joined = joined._replace(fit=whole)

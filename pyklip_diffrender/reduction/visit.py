@@ -179,7 +179,7 @@ def slew_drift(further: float = 0.0) -> WavefrontPrior:
 
 def rough_settings(settings: GaussNewton) -> GaussNewton:
     """Settings of a fit of the target from which the fit of all frames goes on."""
-    return replace(settings, tolerance=max(settings.tolerance, _ROUGH), widen_prior=False)
+    return replace(settings, tolerance=max(settings.tolerance, _ROUGH), adapt_prior=False)
 
 
 def with_references(
@@ -210,7 +210,7 @@ def with_references(
         dither_drift=_DITHERS,
         drift_cycles=_CYCLES,
         tolerance=max(fit.settings.tolerance, _TOLERANCE),
-        widen_prior=True,
+        adapt_prior=True,
         max_iterations=min(fit.settings.max_iterations, _STEPS),
     )
     if pattern is not None:

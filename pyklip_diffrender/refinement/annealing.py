@@ -11,7 +11,8 @@ and decreases to 0, or to the value that the final residual requires:
 2. `Annealing._anneal` fits the wavefront as well, and lowers kappa from step to step. Where the fit
    stalls because of a bright companion, `Annealing._restart` adds that and goes back to the
    alignment; where it stalls because of bad pixels, these are left out.
-3. `Annealing._finish` leaves out the other bad pixels, and widens a prior that is too narrow.
+3. `Annealing._finish` leaves out the other bad pixels, and gives a prior that is too narrow or too
+   wide another size.
 """
 
 from __future__ import annotations
@@ -472,9 +473,18 @@ _WIDENINGS = 3
 """Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
 
 
+_NARROW = 0.8
+"""Size of the fitted wavefront, relative to its prior, below which the prior is narrowed."""
+
+_NARROWINGS = 3
+_SOLUTIONS = 8
+_SAME_SIZE = 0.05
+"""Largest number of times that a prior is narrowed, that of solutions of a linear model from which
+its size follows, and change of the size between these that is negligible."""
+
 _EARLY = 2
-"""Number of steps of a fit that continues another one, after which the size of the drift between
-frames is measured for the first time."""
+"""Number of steps of a fit that continues another one, after which the sizes of the wavefront and
+of the drift between frames are measured for the first time."""
 
 _DRIFT_STEPS = 2
 _SAME_DRIFT = 0.25
@@ -544,8 +554,8 @@ class Annealing:
             error = self.solver.allowed_error(final=True)
             known = derivatives_of(earlier, self.objective.forwards, error)
             self.solver.equations.start_from(known)
-            widened = earlier.settings.widen_prior or not settings.widen_prior
-            self._has_scales = earlier.status.calibrated and widened
+            adapted = earlier.settings.adapt_prior or not settings.adapt_prior
+            self._has_scales = earlier.status.calibrated and adapted
 
     def run(self) -> Refinement:
         """Fit the alignment, then alignment and wavefront; return the best iterate."""
@@ -557,7 +567,8 @@ class Annealing:
                 bar.update(chi2=course.chi2)
                 may_measure = self._is_warm and not self._has_scales
                 if may_measure and len(self.history) == _EARLY:
-                    end, _ = self._with_drift_of(self._end_of(course))
+                    end = self._end_of(course)
+                    end, _ = self._with_drift_of(self._with_settings(end, self._narrowed(end)))
                     course.carried, course.settings = end.carried, end.settings
                 converged = (self._anneal if course.modes else self._align)(course, gain)
         end, status = self._finish(replace(self._end_of(course), state=course.best), converged)
@@ -704,8 +715,9 @@ class Annealing:
         """Correct what the residual of the best iterate shows to be wrong."""
         best = self._without_outliers(best)
         if converged and not self._has_scales:
-            if self.settings.widen_prior:
+            if self.settings.adapt_prior:
                 best = self._with_wider_prior(best)
+            best = self._with_narrower_prior(best)
             best = self._with_measured_drift(best)
         if best.state.flux <= 0:
             return best, Status.DIVERGED
@@ -735,6 +747,41 @@ class Annealing:
             end = self._with_settings(end, end.settings.with_wider_priors(ratios))
             end = self._without_outliers(self._gone_on(end, self.settings.max_iterations))
         return end
+
+    def _with_narrower_prior(self, end: _Fitted) -> _Fitted:
+        """Lower the scales of a prior that is too wide, and go on with them."""
+        for _ in range(_NARROWINGS):
+            settings = self._narrowed(end)
+            if settings is end.settings:
+                break
+            end = self._gone_on(self._with_settings(end, settings), self.settings.max_iterations)
+        return end
+
+    def _narrowed(self, end: _Fitted) -> GaussNewton:
+        """Settings with a prior of the highest evidence; those of `end` unless it is narrower."""
+        # The most probable wavefront and flux are found together. Where the prior is too wide, the
+        # likelihood leaves the wavefront free to be smaller, which the prior favours, and the flux
+        # of the star comes out too high. Without a map, only the product of the flux and the square
+        # of the wavefront's size is known, and neither can be measured.
+        settings, priors = end.settings, end.carried.priors
+        is_fixed = settings.wavefront and not settings.prior.fit_scales
+        has_map = bool(self.problems[0].initial.data.any())
+        if not (settings.adapt_prior and is_fixed and has_map) or self._unexplained(end.state):
+            return settings
+        update = self._posterior(end)
+        size = priors.size(update)
+        if size > _NARROW:
+            return settings
+        for _ in range(_SOLUTIONS):
+            amplitude = priors.ratios(update)["amplitude"]
+            settings = settings.with_narrower_prior(size, amplitude)
+            priors = self.solver.priors_of(settings)
+            update = self.solver.posterior(end.state, priors)
+            size = priors.size(update)
+            if size > 1 - _SAME_SIZE:
+                break
+        _log.info("the wavefront is smaller than its prior says, which is now %s", settings.prior)
+        return settings
 
     def _with_measured_drift(self, end: _Fitted) -> _Fitted:
         """Give the drift between frames the size that maximises the evidence, and go on with it."""

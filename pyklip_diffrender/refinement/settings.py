@@ -61,7 +61,7 @@ _DRIFT_RANGE = 4.0
 """Largest factor between the scale of a drift that maximises the evidence and the one stated."""
 
 _SWITCHES = (
-    "wavefront", "grow_basis", "coarse_first", "widen_prior", "companions_if_stalled",
+    "wavefront", "grow_basis", "coarse_first", "adapt_prior", "companions_if_stalled",
     "accurate_steps",
 )  # fmt: skip
 """Fields of `GaussNewton` that are True or False."""
@@ -130,10 +130,12 @@ class GaussNewton:
         the star's known brightness, as the light that the pupil collects in the unit of the frames.
     prior : WavefrontPrior
         Prior on the wavefront's change from the starting map.
-    widen_prior : bool
+    adapt_prior : bool
         Where a prior with fixed scales makes the fitted wavefront improbable (status
         `PRIOR_MISMATCH`), raise its scales, and those of `drift`, towards the highest evidence and
-        continue the fit, up to three times.
+        continue the fit, up to three times. Where the fitted wavefront is less than 0.8 times as
+        large as its prior says, and a map of the wavefront is known, lower them likewise: with a
+        prior that is too wide, the star's flux comes out too high.
     drift : WavefrontPrior, optional
         Prior on the difference between the wavefronts of several frames. By default all frames
         share one wavefront.
@@ -207,7 +209,7 @@ class GaussNewton:
     basis: Basis | None = None
     deviations: Mapping[str, float] = field(default_factory=dict)
     prior: WavefrontPrior = field(default_factory=WavefrontPrior)
-    widen_prior: bool = False
+    adapt_prior: bool = False
     drift: WavefrontPrior | None = None
     dither_drift: WavefrontPrior | None = None
     drift_cycles: float = 8.0
@@ -310,6 +312,21 @@ class GaussNewton:
             drift=self.drift and self.drift.widened(of_drift),
             dither_drift=self.dither_drift and self.dither_drift.widened(of_dither),
         )
+
+    def with_narrower_prior(self, size: float, amplitude: float) -> GaussNewton:
+        """Return settings with a narrower prior on the wavefront that all frames share.
+
+        Parameters
+        ----------
+        size : float
+            By which the scales of all groups are multiplied.
+        amplitude : float
+            By which that of the amplitude modes is multiplied, if it is below 1.
+        """
+        prior = self.prior
+        scales = {name: size * scale for name, scale in prior.scales.items()}
+        amplitude_scale = min(1.0, amplitude) * prior.amplitude_scale
+        return replace(self, prior=replace(prior, scales=scales, amplitude_scale=amplitude_scale))
 
     def with_drift_scales(self, ratios: Mapping[str, float], within: GaussNewton) -> GaussNewton:
         """Return settings whose drifts have scales multiplied by ratios, within bounds.
@@ -415,7 +432,7 @@ class GaussNewton:
                 amplitude_scale=2.0,
                 amplitude_slope=0.5,
             ),
-            widen_prior=True,
+            adapt_prior=True,
             # Finer modes cost time and leave chi-squared within 3 %.
             cycles=(_cycles_to_edge(wavelength, reach),),
             grow_basis=False,
@@ -637,6 +654,17 @@ class ModePriors:
         """Whether the wavefront is too large for its prior."""
         of_wavefront = [ratios[name] for name in self.names if ratios]
         return max(of_wavefront, default=0.0) >= _IMPROBABLE
+
+    def size(self, update: EvidenceUpdate) -> float:
+        """Size of the wavefront that all frames share, relative to its prior."""
+        assert update.variance is not None
+        blocks = {number for each in self.blocks for number in each}
+        first, last = len(self.amplitude), len(self.group) - len(blocks) * self.drift
+        count = len(self.amplitude) + len(self.group)
+        shared = slice(len(update.step) - count + first, len(update.step) - count + first + last)
+        step, variance = update.step[shared], update.variance[shared]
+        deviation = self.deviation[first : first + last]
+        return float(scale_ratios(step, variance, deviation, torch.zeros_like(self.group[:last])))
 
     def ratios(self, update: EvidenceUpdate) -> dict[str, float]:
         """Size of the fitted modes relative to their priors, by group, from all unknowns."""
