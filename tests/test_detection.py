@@ -116,7 +116,7 @@ def test_a_bright_companion_gets_parameters_of_its_own(request, size, contrast):
     assert fit.frames[0].star == pytest.approx(world.expected(), rel=0.02, abs=100)
 
 
-def test_a_prior_that_is_held_too_narrow_is_widened(world):
+def test_a_prior_of_another_size_is_adapted(world):
     observation = world.observed(world.expected(), 4)
     likely = world.fitted(4)
     assert not likely.prior_ratios
@@ -128,7 +128,6 @@ def test_a_prior_that_is_held_too_narrow_is_widened(world):
     assert fit.scales["segment"] == pytest.approx(likely.scales["segment"], rel=0.15)
     assert fit.scales["texture"] == pytest.approx(narrow["texture"])
     assert fit.settings.prior.scales == pytest.approx(fit.scales)
-    # The steps after it are in the history.
     unwidened = world.refined(observation, prior=held)
     assert unwidened.status is Status.PRIOR_MISMATCH
     assert not unwidened.status.calibrated
@@ -139,6 +138,11 @@ def test_a_prior_that_is_held_too_narrow_is_widened(world):
     kept = world.refined(observation, prior=right, adapt_prior=True)
     assert kept.status is Status.CONVERGED
     assert kept.scales == pytest.approx(likely.scales)
+    # One that is too wide is narrowed.
+    wide = WavefrontPrior({n: 4 * s for n, s in likely.scales.items()}, fit_scales=False)
+    kept, fit = (world.refined(observation, prior=wide, adapt_prior=each) for each in (False, True))
+    assert kept.scales == pytest.approx(wide.scales)
+    assert fit.scales == pytest.approx(likely.scales, rel=0.1)
 
 
 def test_the_prior_of_the_amplitude_is_widened_as_well(world):

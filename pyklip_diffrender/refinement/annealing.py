@@ -22,10 +22,12 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 from scipy.signal import fftconvolve
 from torch import Tensor
 
@@ -104,19 +106,32 @@ _APART = 0.15
 """arcsec, about lambda/D; closer to a known companion, peaks are its own residuals."""
 
 
-def bright_companions(
-    objective: Objective, state: State, kappa: float, *, most: int, threshold: float
-) -> list[Planet]:
-    """Find at most `most` point sources in the residual of the first frame of the target.
+class _Matched(NamedTuple):
+    """Sums of a matched filter over the pixels of one frame, at the places of all its pixels.
 
-    Highest S/N first, at the positions of pixels, in the orientation of the first frame.
-    `threshold` is the smallest S/N, in units of the scatter (median absolute deviation) of the S/N
-    map.
+    With the residual r and the image t of a point source at a place, the contrast
+
+        a = sum(r t / sigma^2) / sum(t^2 / sigma^2)
+
+    minimises chi-squared, and its error is the inverse square root of the denominator.
     """
-    has_companions = [each.shows_companions for each in state.unknowns.frames]
-    if most < 1 or True not in has_companions:
-        return []
-    k = has_companions.index(True)
+
+    numerator: NDArray[np.float64]  # (ny, nx)
+    information: NDArray[np.float64]
+    origin: NDArray[np.float64]  # x and y of the first pixel from the star, arcsec
+    scale: NDArray[np.float64]  # arcsec per pixel along x and y
+
+    def at(self, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Both sums at places, (..., 2), between pixels; 0 beyond them."""
+        column, row = np.moveaxis((places - self.origin) / self.scale, -1, 0)
+        numerator, information = (
+            map_coordinates(each, [row, column], order=1) for each in self[:2]
+        )
+        return numerator, information
+
+
+def _matched(objective: Objective, state: State, k: int, kappa: float) -> _Matched:
+    """The matched filter of a point source on the residual of frame `k`."""
     point, forward = state.points[k], objective.forwards[k]
     unknowns, problem, model = point.unknowns, forward.problem, forward.coarse
     residual = torch.where(problem.valid, problem.data - point.total, 0.0).cpu().numpy()
@@ -135,33 +150,56 @@ def bright_companions(
         image = model(forward.coarse_opd(point), **centred).double().cpu().numpy()
     template = unknowns.level("flux", point.vector) * image[::-1, ::-1]
     weight = sigma**-2.0
-    # A matched filter: with the residual r and the template t at a place, the contrast
-    #
-    #     a = sum(r t / sigma^2) / sum(t^2 / sigma^2)
-    #
-    # minimises chi-squared, and its error is the inverse square root of the denominator.
-    # Convolution with the reversed template has these sums at all places.
-    numerator = fftconvolve(residual * weight, template, mode="same")
-    information = fftconvolve(weight, template**2, mode="same")
-    snr = numerator / np.sqrt(np.maximum(information, 1e-300))
-    x, y = (
-        (index - (count - 1) / 2) * scale - float(shift)
-        for index, count, scale, shift in zip(
-            np.indices(residual.shape)[::-1],
-            residual.shape[::-1],
-            model.detector.pixelscale,
-            axis + star,
-            strict=True,
-        )
+    scale = np.array(model.detector.pixelscale, dtype=np.float64)
+    middle = (np.array(residual.shape[::-1]) - 1) / 2
+    # Convolution with the reversed template has the sums at all places.
+    return _Matched(
+        numerator=fftconvolve(residual * weight, template, mode="same"),
+        information=np.maximum(fftconvolve(weight, template**2, mode="same"), 0.0),
+        origin=-middle * scale - np.asarray(axis + star),
+        scale=scale,
     )
-    allowed = (np.hypot(x, y) > _INNER) & np.isfinite(sigma)
-    positions = unknowns.sources(point.vector)[:, 1:] @ unknowns.turn.T
-    for x_known, y_known in positions.tolist():
-        allowed &= np.hypot(x - x_known, y - y_known) > _APART
+
+
+def bright_companions(
+    objective: Objective,
+    state: State,
+    kappa: float,
+    *,
+    most: int,
+    threshold: float,
+    inner: float = _INNER,
+) -> list[Planet]:
+    """Find at most `most` point sources in the residuals of all frames of the target.
+
+    Highest S/N first, at the positions of pixels of the first one, in the orientation of the fit.
+    `threshold` is the smallest S/N, in units of the scatter (median absolute deviation) of the S/N
+    map, further than `inner` arcsec from the star.
+    """
+    shown = [k for k, each in enumerate(state.unknowns.frames) if each.shows_companions]
+    if most < 1 or not shown:
+        return []
+    first, unknowns = shown[0], state.points[shown[0]].unknowns
+    sums = _matched(objective, state, first, kappa)
+    numerator, information = sums.numerator.copy(), sums.information.copy()
+    pixels = np.stack([*np.indices(numerator.shape)[::-1]], axis=-1)
+    places = sums.origin + sums.scale * pixels
+    # Sources turn with the sky from one roll to the next, and errors of the star's model do not.
+    for k in shown[1:]:
+        turn = (state.points[k].unknowns.turn @ unknowns.turn.T).numpy()
+        more = _matched(objective, state, k, kappa).at(places @ turn.T)
+        numerator += more[0]
+        information += more[1]
+    snr = numerator / np.sqrt(np.maximum(information, 1e-300))
+    valid = objective.forwards[first].problem.valid.cpu().numpy()
+    allowed = (np.hypot(places[..., 0], places[..., 1]) > inner) & valid
+    positions = unknowns.sources(state.points[first].vector)[:, 1:] @ unknowns.turn.T
+    for known in positions.numpy():
+        allowed &= np.hypot(*np.moveaxis(places - known, -1, 0)) > _APART
     scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
     return [
         Planet.from_offset(
-            float(numerator[peak] / information[peak]), float(x[peak]), float(y[peak])
+            float(numerator[peak] / information[peak]), *map(float, places[peak])
         ).rotated(-unknowns.roll)
         for peak in local_maxima(snr, allowed, threshold * scatter, size=7)[:most]
     ]
@@ -430,15 +468,23 @@ planet of contrast 1e-4 at 0.3 arcsec were mistaken for planets at 0.005 to 0.1.
 _BRIGHT = 8.0
 """S/N of a companion, in units of the scatter, that is added when the fit of the wavefront stalls.
 
-Without companions, peaks reached 6 (drifts of 40 to 400 h), and 7 in aligned real frames.
-Companions that stalled a fit had 12, and two neighbours of 1e-3 of the star's flux 34 and 17.
+Without companions, peaks reached 6 (drifts of 40 to 400 h). Companions that stalled a fit had 12.
 """
+
+_FIELD = 7.0
+_OUTER = 0.7
+"""S/N and separation, arcsec, of further companions that are added to an aligned star. In pairs of
+real rolls, peaks reached 9 within 0.6 arcsec and 5 beyond; two neighbours of 1e-3 of the star's
+flux had 34 and 17, and the last of those that spoil a fit in a crowded field 9."""
+
+_HOPELESS = 0.1
+"""Model error, as a fraction of the star, that only sources leave where the wavefront is free."""
 
 _FAINT = 5.0
 """S/N of a companion below which the last steps of a fit do without it, that of a candidate. Errors
 of the wavefront had less than 1 in real frames."""
 
-_MOST_BRIGHT = 8
+_MOST_BRIGHT = 20
 """Largest number of companions that a fit may add in this way."""
 
 _ALIGNED = 0.05
@@ -570,6 +616,8 @@ class Annealing:
                     end = self._end_of(course)
                     end, _ = self._with_drift_of(self._with_settings(end, self._narrowed(end)))
                     course.carried, course.settings = end.carried, end.settings
+                    # Under a narrower prior the best state has a larger chi-squared.
+                    course.best, course.least = course.state, NOTHING
                 converged = (self._anneal if course.modes else self._align)(course, gain)
         end, status = self._finish(replace(self._end_of(course), state=course.best), converged)
         return conclude(
@@ -764,9 +812,10 @@ class Annealing:
         # of the star comes out too high. Without a map, only the product of the flux and the square
         # of the wavefront's size is known, and neither can be measured.
         settings, priors = end.settings, end.carried.priors
-        is_fixed = settings.wavefront and not settings.prior.fit_scales
         has_map = bool(self.problems[0].initial.data.any())
-        if not (settings.adapt_prior and is_fixed and has_map) or self._unexplained(end.state):
+        is_fixed = settings.wavefront and not settings.prior.fit_scales
+        may_narrow = settings.adapt_prior and is_fixed and has_map
+        if not may_narrow or self._unexplained(end.state):
             return settings
         update = self._posterior(end)
         size = priors.size(update)
@@ -898,11 +947,12 @@ class Annealing:
     def _significant(self, course: Course) -> list[Planet]:
         """Companions in the residual of the alignment."""
         most, threshold = self._room(course), self.settings.companion_threshold
+        inner = _INNER
         if most < 1 and self._may_add and self.settings.wavefront:
             # Brighter than all that the wavefront can have left.
-            most, threshold = min(1, most + _MOST_BRIGHT), _BRIGHT
+            most, threshold, inner = min(1, most + _MOST_BRIGHT), _FIELD, _OUTER
         return bright_companions(
-            self.objective, course.state, course.kappa, most=most, threshold=threshold
+            self.objective, course.state, course.kappa, most=most, threshold=threshold, inner=inner
         )
 
     def _with_dominant(self, state: State, carried: StepState) -> tuple[State, StepState]:
@@ -933,7 +983,8 @@ class Annealing:
 
         One at a time, because the side lobes of a bright companion are peaks as well.
         """
-        if not self.settings.companions_if_stalled:
+        is_hopeless = self._may_add and course.error > _HOPELESS
+        if not (self.settings.companions_if_stalled or is_hopeless):
             return []
         most = min(1, self._room(course) + _MOST_BRIGHT)
         return bright_companions(
