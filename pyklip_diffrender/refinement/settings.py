@@ -152,15 +152,15 @@ class GaussNewton:
     max_companions : int
         Largest number of companions that the fit may add if they are significant in the
         residual of the alignment fit. If it is not 0, a source that outshines what the mask leaves
-        of the star is looked for before that fit, and up to eight more are added to it that are too
-        bright to be errors of the wavefront.
+        of the star is looked for before that fit, and up to twenty more are added to it that are
+        too bright to be errors of the wavefront.
     companion_threshold : float
         Smallest S/N of such companions, in units of the scatter of the matched filter.
     companions_if_stalled : bool
         Where the fit of the wavefront stalls far above the noise, search the residual for bright
-        companions, one at a time and up to eight more than `max_companions`, and before that fit
+        companions, one at a time and up to twenty more than `max_companions`, and before that fit
         even if `max_companions` is 0. False for frames whose residual has peaks that are errors of
-        the model.
+        the model: the search then waits until a fit stalls with more than 0.12 of the star's light.
     response_npix : int
         Pupil samples of the coarse copy of the model that computes derivatives.
     response_wavelengths : int
