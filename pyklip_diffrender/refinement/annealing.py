@@ -182,7 +182,7 @@ def bright_companions(
     first, unknowns = shown[0], state.points[shown[0]].unknowns
     sums = _matched(objective, state, first, kappa)
     numerator, information = sums.numerator.copy(), sums.information.copy()
-    pixels = np.stack([*np.indices(numerator.shape)[::-1]], axis=-1)
+    pixels = np.moveaxis(np.indices(numerator.shape)[::-1], 0, -1)
     places = sums.origin + sums.scale * pixels
     # Sources turn with the sky from one roll to the next, and errors of the star's model do not.
     for k in shown[1:]:
@@ -616,11 +616,7 @@ class Annealing:
                 bar.update(chi2=course.chi2)
                 may_measure = self._is_warm and not self._has_scales
                 if may_measure and len(self.history) == _EARLY:
-                    end = self._end_of(course)
-                    end, _ = self._with_drift_of(self._with_settings(end, self._narrowed(end)))
-                    course.carried, course.settings = end.carried, end.settings
-                    # Under a narrower prior the best state has a larger chi-squared.
-                    course.best, course.least = course.state, NOTHING
+                    self._measure_priors(course)
                 converged = (self._anneal if course.modes else self._align)(course, gain)
         end, status = self._finish(replace(self._end_of(course), state=course.best), converged)
         return conclude(
@@ -798,6 +794,18 @@ class Annealing:
             end = self._with_settings(end, end.settings.with_wider_priors(ratios))
             end = self._without_outliers(self._gone_on(end, self.settings.max_iterations))
         return end
+
+    def _measure_priors(self, course: Course) -> None:
+        """Go on with priors of the sizes that the present state of the wavefront shows."""
+        end = self._end_of(course)
+        narrowed = self._narrowed(end)
+        if narrowed is not end.settings:
+            end = self._with_settings(end, narrowed)
+        end, _ = self._with_drift_of(end)
+        if end.settings is not course.settings:
+            course.carried, course.settings = end.carried, end.settings
+            # Under a narrower prior the best state has a larger chi-squared.
+            course.best, course.least = course.state, NOTHING
 
     def _with_narrower_prior(self, end: _Fitted) -> _Fitted:
         """Lower the scales of a prior that is too wide, and go on with them."""
