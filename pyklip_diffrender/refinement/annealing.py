@@ -960,8 +960,11 @@ class Annealing:
         most, threshold = self._room(course), self.settings.companion_threshold
         inner = _INNER
         if most < 1 and self._may_add and self.settings.wavefront:
-            # Brighter than all that the wavefront can have left.
-            most, threshold, inner = min(1, most + _MOST_BRIGHT), _FIELD, _OUTER
+            # Brighter than all that the wavefront can have left. In real frames, peaks near the
+            # star are errors of the model.
+            most, threshold = min(1, most + _MOST_BRIGHT), _BRIGHT
+            if not self.settings.companions_if_stalled:
+                threshold, inner = _FIELD, _OUTER
         return bright_companions(
             self.objective, course.state, course.kappa, most=most, threshold=threshold, inner=inner
         )
