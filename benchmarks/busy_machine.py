@@ -37,7 +37,7 @@ def measure(options: argparse.Namespace, policy: str, threads: int | None) -> di
         command = [
             sys.executable,
             "-m",
-            "pyklip_diffrender.cli",
+            "pyklip_diffrender",
             "reduce",
             *map(str, options.rolls),
         ]

@@ -34,7 +34,7 @@ from pyklip_diffrender.detection.search import significance_of
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.scene.star_place import local_maxima
+from pyklip_diffrender.refinement.residual import local_maxima
 
 Image = NDArray[np.float64]
 

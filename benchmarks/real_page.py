@@ -49,7 +49,7 @@ def measurements(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "star_flux", ["benchmarks.star_flux", "--frames", frames, "--opd", opd]
     products = str(folder / "hip65426")
     wide = ["detect", frames, "--opd", opd, "-o", products, "--wide", "--overwrite"]
-    yield "wide", ["pyklip_diffrender.cli", *wide]
+    yield "wide", ["pyklip_diffrender", *wide]
 
 
 def measure(folder: Path, about: str, task: tuple[str, list[str]]) -> bool:

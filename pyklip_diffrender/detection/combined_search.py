@@ -65,9 +65,9 @@ from pyklip_diffrender.io.units import (
     to_unit,
 )
 from pyklip_diffrender.refinement import Status
+from pyklip_diffrender.refinement.residual import local_maxima
 from pyklip_diffrender.scene.exposure import proper_motion as motion_of
 from pyklip_diffrender.scene.exposure import star_of
-from pyklip_diffrender.scene.star_place import local_maxima
 
 __all__ = ["combine"]
 

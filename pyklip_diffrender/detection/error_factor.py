@@ -35,7 +35,7 @@ from pyklip_diffrender.detection.field import (
     reaching,
     separation_of,
 )
-from pyklip_diffrender.scene.star_place import local_maxima
+from pyklip_diffrender.refinement.residual import local_maxima
 
 __all__ = [
     "CLIP",

@@ -50,7 +50,7 @@ from pyklip_diffrender.detection.templates import groups_of, has_only_reference_
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import require_positive, to_arcsec
 from pyklip_diffrender.refinement import Refinement, Status
-from pyklip_diffrender.scene.star_place import local_maxima
+from pyklip_diffrender.refinement.residual import local_maxima
 
 __all__ = [
     "contrast_curve",

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 __all__ = [
     "center_of_pattern",
     "center_of_symmetry",
-    "local_maxima",
     "measured_offset",
     "stamp_about",
 ]
@@ -149,17 +145,3 @@ def measured_offset(
         return None
     # `stamp_about` has the nearest whole pixel in its middle.
     return np.asarray(np.round(center) + away - center)
-
-
-def local_maxima(
-    image: NDArray[np.float64], allowed: NDArray[np.bool_], threshold: float, *, size: int
-) -> list[tuple[int, int]]:
-    """Row and column of the `allowed` pixels above a threshold that are the maximum of a square.
-
-    `image` is (ny, nx), NaN where unknown; the square about a pixel has the side `size`. The
-    highest maximum is first.
-    """
-    filled = np.where(np.isnan(image), -math.inf, image)
-    peaks = (filled == maximum_filter(filled, size=size)) & allowed & (filled > threshold)
-    places = np.argwhere(peaks)[np.argsort(-filled[peaks], kind="stable")]
-    return [(int(row), int(column)) for row, column in places]

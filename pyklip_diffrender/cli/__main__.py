@@ -1,7 +1,0 @@
-"""``python -m pyklip_diffrender.cli``, the same as ``pyklip-diffrender``."""
-
-import sys
-
-from pyklip_diffrender.cli import main
-
-sys.exit(main())
