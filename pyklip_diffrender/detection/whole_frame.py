@@ -28,7 +28,7 @@ from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.optics.planes import Detector
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement import FrameFit
-from pyklip_diffrender.refinement.fit_result import pixel_grid
+from pyklip_diffrender.refinement.forward import pixel_grid
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 

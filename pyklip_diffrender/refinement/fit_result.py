@@ -26,7 +26,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
 from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.units import ARCSEC, native_float64
+from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import LEVELS, parameter
@@ -41,6 +41,7 @@ from pyklip_diffrender.refinement.fit_file import (
     reading,
     text_hdu,
 )
+from pyklip_diffrender.refinement.forward import pixel_grid
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.unknowns import brightest
 from pyklip_diffrender.scene.objects import Planet
@@ -57,7 +58,6 @@ __all__ = [
     "Status",
     "breakdown_explained",
     "parameter_table",
-    "pixel_grid",
 ]
 
 
@@ -333,18 +333,6 @@ class FrameFit:
             gain=image(hdus, "GAIN", k),
             coefficients=image(hdus, "COEFFICIENTS", k),
         )
-
-
-def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np.float64]:
-    """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
-    detector = model.detector
-    x, y = (
-        (axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC).cpu().numpy()
-        for axis in detector.axes(values)
-    )
-    star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu().numpy()
-    across, up = np.meshgrid(x, y)
-    return np.stack([across - star[0], up + detector.shear * across - star[1]], axis=-1)
 
 
 def parameter_table(frames: Sequence[FrameFit]) -> QTable:

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
 from pyklip_diffrender.instrument.masks import mask_of_header
-from pyklip_diffrender.io.units import to_number
+from pyklip_diffrender.io.units import ARCSEC, to_number
 from pyklip_diffrender.linear.model import Noise
 from pyklip_diffrender.linear.response import (
     NANOMETRE,
@@ -43,6 +44,7 @@ __all__ = [
     "Problem",
     "State",
     "allowance",
+    "pixel_grid",
     "starting_values",
 ]
 
@@ -225,6 +227,18 @@ def starting_values(
     if "detector_shift" in start or np.abs(axis).max() <= 1e-10:
         return dict(start)
     return {**start, "detector_shift": axis}
+
+
+def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np.float64]:
+    """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
+    detector = model.detector
+    x, y = (
+        (axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC).cpu().numpy()
+        for axis in detector.axes(values)
+    )
+    star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu().numpy()
+    across, up = np.meshgrid(x, y)
+    return np.stack([across - star[0], up + detector.shear * across - star[1]], axis=-1)
 
 
 # The forward model of a fit and its derivatives, at a point of the unknowns.

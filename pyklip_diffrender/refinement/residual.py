@@ -13,8 +13,7 @@ from scipy.signal import fftconvolve
 from torch import Tensor
 
 from pyklip_diffrender.linear.model import LinearModel, TemplateProducts
-from pyklip_diffrender.refinement.fit_result import pixel_grid
-from pyklip_diffrender.refinement.forward import Objective, State
+from pyklip_diffrender.refinement.forward import Objective, State, pixel_grid
 from pyklip_diffrender.scene.objects import Planet
 
 __all__ = ["INNER", "bright_companions", "isolated_outliers", "local_maxima", "with_dominant"]
@@ -59,14 +58,15 @@ class _Matched(NamedTuple):
 
     numerator: NDArray[np.float64]  # (ny, nx)
     information: NDArray[np.float64]
-    origin: NDArray[np.float64]  # x and y of the first pixel from the star, arcsec
-    scale: NDArray[np.float64]  # arcsec per pixel along x and y
+    grid: NDArray[np.float64]  # (ny, nx, 2), x and y from the star, arcsec
 
     def at(self, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Both sums at places, (..., 2), between pixels; 0 beyond them."""
-        column, row = np.moveaxis((places - self.origin) / self.scale, -1, 0)
+        first, steps = self.grid[0, 0], self.grid[[0, 1], [1, 0]] - self.grid[0, 0]
+        column, row = np.moveaxis((places - first) @ np.linalg.inv(steps), -1, 0)
         numerator, information = (
-            map_coordinates(each, [row, column], order=1) for each in self[:2]
+            map_coordinates(each, [row, column], order=1)
+            for each in (self.numerator, self.information)
         )
         return numerator, information
 
@@ -79,7 +79,6 @@ def _matched(objective: Objective, state: State, k: int, kappa: float) -> _Match
     sigma = torch.where(problem.valid, objective.sigma(k, point, kappa), math.inf).cpu().numpy()
     values = unknowns.values(point.vector)
     star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
-    axis = values.get("detector_shift", torch.zeros(2, dtype=torch.float64)).cpu()
     # The template is an image in the middle of the array of a source beyond the occulter.
     displacement = torch.tensor([1.5, 0.0], dtype=torch.float64)
     centred = {
@@ -91,14 +90,11 @@ def _matched(objective: Objective, state: State, k: int, kappa: float) -> _Match
         image = model(forward.coarse_opd(point), **centred).double().cpu().numpy()
     template = unknowns.level("flux", point.vector) * image[::-1, ::-1]
     weight = sigma**-2.0
-    scale = np.array(model.detector.pixelscale, dtype=np.float64)
-    middle = (np.array(residual.shape[::-1]) - 1) / 2
     # Convolution with the reversed template has the sums at all places.
     return _Matched(
         numerator=fftconvolve(residual * weight, template, mode="same"),
         information=np.maximum(fftconvolve(weight, template**2, mode="same"), 0.0),
-        origin=-middle * scale - np.asarray(axis + star),
-        scale=scale,
+        grid=pixel_grid(model, values),
     )
 
 
@@ -123,8 +119,7 @@ def bright_companions(
     first, unknowns = shown[0], state.points[shown[0]].unknowns
     sums = _matched(objective, state, first, kappa)
     numerator, information = sums.numerator.copy(), sums.information.copy()
-    pixels = np.moveaxis(np.indices(numerator.shape)[::-1], 0, -1)
-    places = sums.origin + sums.scale * pixels
+    places = sums.grid
     # Sources turn with the sky from one roll to the next, and errors of the star's model do not.
     for k in shown[1:]:
         turn = (state.points[k].unknowns.turn @ unknowns.turn.T).numpy()
