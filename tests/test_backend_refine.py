@@ -173,6 +173,11 @@ def test_what_is_detected_keeps_its_light(small, tmp_path):
         kept[keep] = np.mean(shares)
     assert kept[False] < 0.85
     assert kept[True] == pytest.approx(1.0, abs=0.1)
+    brighter = dataset(exposed(5e-6), small)
+    with backend(opd=OLD):
+        reduce(brighter, tmp_path)
+    (fit,) = brighter.diffrender_results[0].subtraction.fits
+    assert len(fit.result.companions) == 1  # Both rolls together show it to the fit.
 
 
 @pytest.mark.parametrize(("angle", "flipx"), [(70.0, False), (-130.0, True)])

@@ -15,11 +15,7 @@ from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import disk as module
-from pyklip_diffrender.detection import (
-    has_bright_pixels_beyond,
-    wide_field,
-    without_blurred_edges,
-)
+from pyklip_diffrender.detection import has_bright_pixels_beyond, wide_field, without_blurred_edges
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
