@@ -53,7 +53,6 @@ from pyklip_diffrender.pyklip_backend import (
 PRODUCT = "x-KLmodes-all.fits"
 
 # pyKLIP 2.10 takes the mean of sections that are all NaN.
-pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
 
 
 @pytest.fixture

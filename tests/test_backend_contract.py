@@ -25,7 +25,6 @@ from pyklip_diffrender.pyklip_backend import (
 from pyklip_diffrender.pyklip_backend.patch import spawned_beside_klip
 
 # pyKLIP 2.10 takes the mean of sections that are all NaN.
-pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
 
 
 class PipelineData(Data):

@@ -23,10 +23,7 @@ from pyklip_diffrender.pyklip_backend import (
 NATIVE = (20.7, 25.2)
 MIDDLE = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning"),
-    pytest.mark.usefixtures("offline", "registered"),
-]
+pytestmark = pytest.mark.usefixtures("offline", "registered")
 
 
 @pytest.fixture

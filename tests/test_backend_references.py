@@ -26,10 +26,7 @@ CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}
 TARGET = {"TARGPROP": "TARGET", "IS_PSF": False, **CARDS}
 REFERENCE = {"TARGPROP": "REF", "IS_PSF": True, **CARDS}
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning"),
-    pytest.mark.usefixtures("offline", "registered"),
-]
+pytestmark = pytest.mark.usefixtures("offline", "registered")
 
 
 @pytest.fixture

@@ -31,10 +31,7 @@ from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.surveys import execution, jobs
 from pyklip_diffrender.wavefront import random_opd
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning"),
-    pytest.mark.usefixtures("offline"),
-]
+pytestmark = pytest.mark.usefixtures("offline")
 
 SIZE = 36
 OPD = 0.1 * random_opd(1, npix=128).data

@@ -23,11 +23,8 @@ from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.scene import Planet
 from pyklip_diffrender.wavefront import default_basis, random_drift, random_opd
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning"),
-    # Of pyKLIP's spline through the user's PSF.
-    pytest.mark.filterwarnings("ignore:.*rank deficient:UserWarning"),
-]
+# Of pyKLIP's spline through the user's PSF.
+pytestmark = pytest.mark.filterwarnings("ignore:.*rank deficient:UserWarning")
 
 PIXEL, SIDE, STAMP = 0.062424185, 40, 17
 ANGLES, CENTER = (15.0, 85.0), np.array([19.8, 19.4])
