@@ -24,6 +24,7 @@ from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, Incompat
 from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.refinement import Status, refine_again
+from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.scene import Planet, world_coordinates
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -116,7 +117,7 @@ def test_a_bright_companion_gets_parameters_of_its_own(request, size, contrast):
     assert fit.frames[0].star == pytest.approx(world.expected(), rel=0.02, abs=100)
 
 
-def test_a_prior_of_another_size_is_adapted(world):
+def test_a_prior_of_another_size_is_adapted(world, monkeypatch):
     observation = world.observed(world.expected(), 4)
     likely = world.fitted(4)
     assert not likely.prior_ratios
@@ -142,6 +143,11 @@ def test_a_prior_of_another_size_is_adapted(world):
     # Also on the way of a fit that continues another, whose last state is the best one then.
     again = refine_again(kept, adapt_prior=True, tolerance=1e-9)
     assert again.chi2_per_pixel == pytest.approx(fit.chi2_per_pixel, abs=5e-3)
+    # One that was adapted is not measured again.
+    monkeypatch.delattr(Annealing, "_narrowed")
+    assert refine_again(fit).scales == pytest.approx(fit.scales)
+    with pytest.raises(AttributeError, match="_narrowed"):
+        refine_again(kept, adapt_prior=True)
 
 
 def test_the_prior_of_the_amplitude_is_widened_as_well(world):
