@@ -87,6 +87,7 @@ class Course:
     # and drop them for ever.
     may_drop: bool = True
     outlier_searches: int = _ROUNDS  # Number of searches for bad pixels that may follow.
+    may_settle: bool = True  # Whether the priors have not been measured near the solution.
 
 
 # The result of a fit: errors of the unknowns about its final state, and the images of the star.
@@ -274,10 +275,12 @@ _NARROW = 0.8
 _NARROWINGS = 3
 _SOLUTIONS = 8
 _SAME_SIZE = 0.05
+_LEAST_SLOPE = 0.2
 """Largest number of times that a prior is narrowed, that of solutions of a linear model from which
-its size follows, and change of the size between these that is negligible."""
+the size of the wavefront follows, logarithm of that size which is negligible, and least change of
+it that is believed, relative to that of the scale."""
 
-_EARLY = 2
+_EARLY = 1
 """Number of steps of a fit that continues another one, after which the sizes of the wavefront and
 of the drift between frames are measured for the first time."""
 
@@ -360,9 +363,8 @@ class Annealing:
             while course.remaining and not converged:
                 gain = self._step(course)
                 bar.update(chi2=course.chi2)
-                may_measure = self._is_warm and not self._has_scales
-                if may_measure and len(self.history) == _EARLY:
-                    self._measure_priors(course)
+                if self._is_warm and not self._has_scales:
+                    self._measure_on_the_way(course, gain)
                 converged = (self._anneal if course.modes else self._align)(course, gain)
         end, status = self._finish(replace(self._end_of(course), state=course.best), converged)
         return conclude(
@@ -491,11 +493,14 @@ class Annealing:
         They would double the time of every step. The search finds a faint source without them.
         """
         is_close = course.error <= max(_NEAR, self.settings.min_model_error)
-        if not (course.may_drop and is_close):
+        first, present = (
+            len(each.unknowns.frames[0].companions) for each in (self._begin, course.state)
+        )
+        if not (course.may_drop and is_close and present > first):
             return False
         snr = self.solver.companion_snr(course.state, course.carried.priors)
         faint = snr < _FAINT
-        faint[: len(self._begin.unknowns.frames[0].companions)] = False
+        faint[:first] = False
         if not bool(faint.any()):
             return False
         _log.info("companions of S/N %s are dropped", snr[faint].tolist())
@@ -541,6 +546,20 @@ class Annealing:
             end = self._without_outliers(self._gone_on(end, self.settings.max_iterations))
         return end
 
+    def _measure_on_the_way(self, course: Course, gain: float) -> None:
+        """Measure priors early, and once more, without bad pixels, where steps gain little.
+
+        The sizes of the wavefront and its drift change the solution more than the last steps do.
+        """
+        if len(self.history) == _EARLY:
+            self._measure_priors(course)
+        elif course.may_settle and course.modes and gain < _STALLED:
+            course.may_settle = False
+            if course.outlier_searches:
+                self._go_on_without_outliers(course)
+            if course.modes:
+                self._measure_priors(course)
+
     def _measure_priors(self, course: Course) -> None:
         """Go on with priors of the sizes that the present state of the wavefront shows."""
         end = self._end_of(course)
@@ -578,14 +597,19 @@ class Annealing:
         size = priors.size(update)
         if size > _NARROW:
             return settings
+        # The logarithm of the size is nearly linear in that of the prior's scale, so that the last
+        # two solutions say where it is 0 (secant method).
+        log_size, slope = math.log(size), 1.0
         for _ in range(_SOLUTIONS):
-            amplitude = priors.ratios(update)["amplitude"]
-            settings = settings.with_narrower_prior(size, amplitude)
+            change = log_size / slope
+            amplitude = priors.ratios(update)["amplitude"] ** (1 / slope)
+            settings = settings.with_narrower_prior(math.exp(change), amplitude)
             priors = self.solver.priors_of(settings)
             update = self.solver.posterior(end.state, priors)
-            size = priors.size(update)
-            if size > 1 - _SAME_SIZE:
+            last, log_size = log_size, math.log(priors.size(update))
+            if abs(log_size) < _SAME_SIZE:
                 break
+            slope = min(1.0, max(_LEAST_SLOPE, (last - log_size) / change))
         _log.info("the wavefront is smaller than its prior says, which is now %s", settings.prior)
         return settings
 
