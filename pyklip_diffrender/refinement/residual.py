@@ -1,4 +1,4 @@
-"""What the residual of a fit shows: point sources, and bad pixels that the file does not flag."""
+"""Point sources in the residual of a fit, and bad pixels that the file does not flag."""
 
 from __future__ import annotations
 
