@@ -1,15 +1,17 @@
-"""A bright source beside a real star, from files to limits: is it found, and what does it cost?
+"""Sources beside a real star, from files to limits: are they found, and what do they cost?
 
 Run from the root of the project::
 
-    python -m benchmarks.neighbours FRAMES MAP -o neighbours.ecsv [--jobs N]
+    python -m benchmarks.neighbours FRAMES MAP -o neighbours.ecsv [--jobs N] [--fields N]
 
 FRAMES is the folder with the calints files of programme 1184. A source is added to both rolls of
 G 7-34 in F444W, as the fit of the untouched files renders it, with photon noise and the errors that
 it adds, but without the flat-field pattern, which real companions hardly show. The changed files
 are reduced with the defaults. A row says whether both files were used as before, whether the source
 is among the companions of the fit and the candidates, its measured contrast and position, what else
-was found, and the ratio of the limits further than 1.5 lambda/D from it to those without it.
+was found, and the ratio of the limits further than 1.5 lambda/D from it to those without it. With
+--fields, as many fields of 300 stars take the place of the single sources: of those that the limits
+without them would show, how many are found?
 """
 
 from __future__ import annotations
@@ -47,22 +49,45 @@ CASES = (
     (1e-2, 2.0), (0.1, 0.4), (0.1, 0.8), (0.1, 1.5), (0.1, 2.2),
 )  # fmt: skip
 """Contrasts, and separations in arcsec."""
+STARS, FIELD, EDGE, INNER = 300, 20.0, 4.9, 0.3
+"""Stars in a field, its side, and how far from the star they are rendered, arcsec."""
+FAINTEST, SLOPE = (5e-7, 1e-3), 0.75
+"""Range of their contrasts, of which more than c are in proportion to c to the power of -0.75."""
+
+
+def sources_of(case: tuple[float, float]) -> NDArray[Any]:
+    """Contrast and x, y in arcsec of the sources of a case, (k, 3).
+
+    It is the contrast and separation of one source; or nan and the number of a field of stars.
+    """
+    contrast, separation = case
+    if np.isfinite(contrast):
+        return np.array([[contrast, *dr.Planet(contrast, separation, ANGLE).offset]])
+    rng = np.random.default_rng(int(separation))
+    places = rng.uniform(-FIELD / 2, FIELD / 2, (STARS, 2))
+    least, most = (each**-SLOPE for each in FAINTEST)
+    contrasts = (least - rng.uniform(size=STARS) * (least - most)) ** (-1 / SLOPE)
+    inside = (np.abs(places).max(axis=1) < EDGE) & (np.hypot(*places.T) > INNER)
+    return np.column_stack([contrasts, places])[inside]
 
 
 def light_of(
-    reduction: dr.Reduction, cut: dr.Sequence, contrast: float, separation: float
+    reduction: dr.Reduction, cut: dr.Sequence, sources: NDArray[Any]
 ) -> list[NDArray[Any]]:
-    """The source in each frame of `cut`, (ny, nx), on the pixels of the detector."""
+    """Light of the sources in each frame of `cut`, (ny, nx), on the pixels of the detector."""
     frames = reduction.fit.frames
-    planet = dr.Planet(contrast, separation, ANGLE)
     lights = []
     for frame, part in zip(frames, cut.science, strict=True):
         roll = frame.observation.roll_from(frames[0].observation)
-        x, y = frame.values["star_offset"] + planet.rotated(roll).offset
-        light = frame.render(
-            part.shape, tuple(part.center[0]), background=False, source=(float(x), float(y))
-        )
-        lights.append(contrast * light.reshape(part.shape))
+        light = np.zeros(part.shape)
+        for contrast, *place in sources.tolist():
+            planet = dr.Planet.from_offset(contrast, *place)
+            x, y = frame.values["star_offset"] + planet.rotated(roll).offset
+            one = frame.render(
+                part.shape, tuple(part.center[0]), background=False, source=(float(x), float(y))
+            )
+            light += contrast * one.reshape(part.shape)
+        lights.append(light)
     return lights
 
 
@@ -105,12 +130,12 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
     """Reduce the files with one source."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    contrast, separation = case
-    row: dict[str, Any] = {"contrast": contrast, "separation": separation, "outcome": "as before"}
+    sources = sources_of(case)
+    row: dict[str, Any] = {"contrast": case[0], "separation": case[1], "outcome": "as before"}
     paths = sorted(frames.glob(NAMES))
     sequence = dr.Sequence.from_files(paths)
     with tempfile.TemporaryDirectory() as place:
-        lights = [contrast * light for light in base["light"][separation]]
+        lights = light_of(base["untouched"], sequence.cutout(SIDE), sources)
         with_source(paths, Path(place), sequence, lights)
         try:
             changed = dr.Sequence.from_files(place)
@@ -125,43 +150,49 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
         except DiffrenderError as error:
             return row | {"outcome": f"no fit: {error}"}
     detection = reduction.detection
-    north = detection.north
-    angle = np.deg2rad(ANGLE)
-    place_ = separation * np.array([-np.sin(angle), np.cos(angle)])
-    x, y = np.moveaxis(detection.grid, -1, 0)
-    away = np.hypot(x - place_[0], y - place_[1])
+    without = base["untouched"].detection
+    flux, before = (each.fit.frames[0].flux for each in (reduction, base["untouched"]))
+
+    def away(places: NDArray[Any], others: NDArray[Any]) -> NDArray[Any]:
+        """Distances (..., k) of places from others (k, 2)."""
+        return np.hypot(*np.moveaxis(places[..., None, :] - others, -1, 0))
+
+    # Those that are bright enough to be seen without the others.
+    nearest = away(sources[:, 1:], without.grid.reshape(-1, 2)).argmin(axis=-1)
+    limits = detection.threshold * without.error.ravel()[nearest]
+    half = np.abs(without.grid).max()
+    seen = sources[(sources[:, 0] > limits) & (np.abs(sources[:, 1:]).max(axis=1) < half)]
+    shown = seen if len(sources) > 1 else sources
     resolution = reduction.fit.model.resolution
-    distance = np.hypot(x, y)
-    far = (away > 1.5 * resolution) & (distance > 0.3) & np.isfinite(detection.error)
-    error = detection.error * detection.error_factor.of(detection.grid)
-    flux = reduction.fit.frames[0].flux
-    ratio = (flux * error / base["error"])[far]
-    unscaled = (flux * detection.error / base["unscaled"])[far]
-    photon = (flux * detection.photon_error / base["photon"])[far]
-    found = false = 0
+    far = (away(detection.grid, shown[:, 1:]) > 1.5 * resolution).all(axis=-1)
+    far &= (np.hypot(*np.moveaxis(detection.grid, -1, 0)) > 0.3) & np.isfinite(detection.error)
+    ratio = (flux * detection.error / (before * without.error))[far]
+    photon = (flux * detection.photon_error / (before * without.photon_error))[far]
+    found, false = set(), 0
     wide = reduction.wide
     for candidate in detection.candidates if wide is None else wide.candidates:
-        position = candidate["position_angle"].to_value("deg") - north
+        position = np.deg2rad(candidate["position_angle"].to_value("deg") - detection.north)
         r = candidate["separation"].to_value("arcsec")
-        there = r * np.array([-np.sin(np.deg2rad(position)), np.cos(np.deg2rad(position))])
-        if np.hypot(*(there - place_)) < 0.5 * resolution:
-            found += 1
-            measured = float(candidate["contrast"]) * flux / base["flux"]
-            row["measured"] = measured / contrast
-            row["pull"] = (measured - contrast) / (
-                float(candidate["contrast_error"]) * flux / base["flux"]
-            )
-            row["off_mas"] = 1e3 * float(np.hypot(*(there - place_)))
-        else:
+        there = r * np.array([-np.sin(position), np.cos(position)])
+        distances = away(there, sources[:, 1:])
+        nearest = int(distances.argmin())
+        if distances[nearest] > 0.5 * resolution:
             false += 1
+            continue
+        found.add(nearest)
+        measured = float(candidate["contrast"]) * flux / before
+        deviation = float(candidate["contrast_error"]) * flux / before
+        if len(sources) == 1:
+            row["measured"] = measured / sources[0, 0]
+            row["pull"] = (measured - sources[0, 0]) / deviation
+            row["off_mas"] = 1e3 * float(distances[nearest])
     scatter = np.nanstd(np.clip(detection.residual_snr[far], -5, 5))
     return row | {
         "status": reduction.fit.status.name, "chi2": float(reduction.fit.chi2_per_pixel),
-        "star": flux / base["flux"], "found": found, "false": false,
+        "star": flux / before, "visible": len(shown), "found": len(found), "false": false,
         "companions": len(reduction.fit.planets),
         "limits": float(np.nanmedian(ratio)), "limits_90": float(np.nanpercentile(ratio, 90)),
         "limits_10": float(np.nanpercentile(ratio, 10)), "scatter": float(scatter),
-        "unscaled_limits": float(np.nanmedian(unscaled)),
         "photon_limits": float(np.nanmedian(photon)),
         "photon_limits_90": float(np.nanpercentile(photon, 90)),
     }  # fmt: skip
@@ -176,24 +207,21 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--wide", action="store_true", help="search the whole frames as well")
     parser.add_argument("--cases", nargs="+", metavar="CONTRAST,ARCSEC", help="instead of all")
+    parser.add_argument("--fields", type=int, default=0, help="fields of stars, instead of all")
     options = parser.parse_args()
     cases: list[tuple[float, float]] = list(CASES)
     if options.cases:
         pairs = (case.split(",") for case in options.cases)
         cases = [(float(contrast), float(separation)) for contrast, separation in pairs]
+    if options.fields:
+        cases = [(np.nan, float(number)) for number in range(options.fields)]
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     sequence = dr.Sequence.from_files(sorted(options.frames.glob(NAMES)))
     untouched = dr.reduce(sequence, options.map)
-    detection, frames = untouched.detection, untouched.fit.frames
-    around = sequence.cutout(SIDE)
     base = {
         "first": [each.first_pixel for each in sequence.science],
-        "flux": frames[0].flux,
-        "error": frames[0].flux * detection.error * detection.error_factor.of(detection.grid),
-        "unscaled": frames[0].flux * detection.error,
-        "photon": frames[0].flux * detection.photon_error,
-        "light": {each: light_of(untouched, around, 1.0, each) for each in {r for _, r in cases}},
+        "untouched": untouched,
         "wide": options.wide,
     }
     work = partial(one, options.frames, options.map, base)

@@ -9,8 +9,7 @@ import torch
 from scipy.signal import convolve2d
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.imaging import SkyModel
-from pyklip_diffrender.imaging.sky_model import _BEAM, _STRENGTH, interpolation_matrix
+from pyklip_diffrender.imaging import _BEAM, _STRENGTH, SkyModel, interpolation_matrix
 
 SIZE, NPIX, CONTRAST = 24, 64, 4e-7
 PLACE = (0.45, 0.3)  # x, y arcsec of a planet from the star in the first frame.

@@ -18,6 +18,7 @@ from pyklip_diffrender.reduction import ReduceOptions, Visit, pipeline
 from pyklip_diffrender.reduction import visit as visits
 from pyklip_diffrender.reduction.visit import with_references
 from pyklip_diffrender.refinement import GaussNewton, align_frame, join_frames, refine
+from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.settings import exposure_sequences
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -270,12 +271,18 @@ def test_exposure_sequences():
     assert exposure_sequences([reference(0), rolled]) == [0, 1]
 
 
-def test_the_size_of_the_drift_is_that_of_the_frames():
+def test_the_size_of_the_drift_is_that_of_the_frames(monkeypatch):
+    """It is measured after the first step, and once more before the last ones."""
     _, fit = alone()
+    steps, measure = [], Annealing._measure_priors
+    recorded = lambda self, course: (steps.append(len(self.history)), measure(self, course))  # noqa: E731
+    monkeypatch.setattr(Annealing, "_measure_priors", recorded)
     stated = WavefrontPrior({"segment": 0.6, "texture": 0.3}, knee=1.0)
     settings = replace(SETTINGS, drift=stated, dither_drift=stated, drift_cycles=6.0)
     joint = together(fit, [reference(k, drift=5e-9) for k in range(3)], settings)
     assert 1.5 < joint.scales["texture dither"] / 0.3 <= 4.0001
+    assert steps[0] == 1 < steps[1] < len(joint.history)
+    assert len(steps) == 2
     for scaled, most in ((True, 8.0), (False, 2.4)):
         slews = replace(stated, scales={"segment": 2.0, "texture": 1.0}, fit_scales=scaled)
         wide = replace(settings, drift=slews)

@@ -195,7 +195,7 @@ class ProductImages:
     def _on_frame(self, flux: Image, frame: FrameFit) -> Image:
         """A map of the first frame on the pixels of a frame."""
         from pyklip_diffrender.detection.field import pixels_of
-        from pyklip_diffrender.imaging.sky_model import interpolation_matrix
+        from pyklip_diffrender.imaging import interpolation_matrix
 
         first = self.maps.groups[0][1].origin
         offsets = first.observation.turned(frame.grid.reshape(-1, 2), frame.observation)

@@ -78,7 +78,7 @@ class SkyImages:
     def posterior_mean(self) -> tuple[Image, Image]:
         """Light of neither star nor detector, and its standard deviation, in the frames' unit.
 
-        See `imaging.sky_model`. Point sources have 0.4 to 1 of their peak, least close to the star,
+        See `imaging`. Point sources have 0.4 to 1 of their peak, least close to the star,
         and no side lobes.
         """
         model = SkyModel(self.detection.fits)

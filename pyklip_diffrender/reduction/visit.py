@@ -35,6 +35,7 @@ from pyklip_diffrender.detection import (
     Detection,
     ReferenceSource,
     contrast_curve,
+    detect,
     sources_of_references,
 )
 from pyklip_diffrender.errors import DiffrenderError
@@ -47,6 +48,7 @@ from pyklip_diffrender.refinement import (
     align_frame,
     join_frames,
 )
+from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -110,6 +112,11 @@ _SEPARATIONS = (0.4, 0.55, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0)
 
 _ANGLES = 6
 """Positions at each of them."""
+
+_SHOWN = 12.0
+"""S/N of a candidate in the target's frames alone above which all candidates are companions of the
+joint fit. Those of more than 25 in all frames would have it refined again, for half of its time,
+and the references make the S/N up to twice as large."""
 
 _FRAME = 2.2
 """Memory for one more frame, relative to the derivatives of its pixels by all unknowns."""
@@ -215,6 +222,8 @@ def with_references(
     )
     if pattern is not None:
         settings = with_known_pattern(settings)
+    alone = None if search is None else search(fit)
+    companions = _companions(fit, alone) if used else ()
     joint: Refinement | None = None
     remarks: dict[str, str] = {}
     with stage("reference stars and target together"):
@@ -228,7 +237,10 @@ def with_references(
                 used, aligned = _aligned(fit, used, settings, pattern, left_out, remarks)
                 if not used:
                     break
-                joint = join_frames(fit, aligned, settings, systematics=pattern, progress=progress)
+                joint = join_frames(
+                    fit, aligned, settings, systematics=pattern, companions=companions,
+                    progress=progress,
+                )  # fmt: skip
             except DiffrenderError as error:
                 _log.warning("the reference frames are not fitted with the target: %s", error)
                 left_out |= {each.name: f"the joint fit failed: {error}" for each in used}
@@ -247,21 +259,31 @@ def with_references(
             reason = "what contradicts the target in the frames of reference stars has no end"
             left_out |= {each.name: reason for each in used}
     if joint is None or not joint.status.usable:
-        return Joined(fit, Visit(_left_out(references, left_out)))
-    searches = None if search is None else (search(fit), search(joint))
-    gain = _gain(fit, joint) if searches is None else _stated_gain(*searches)
+        return Joined(fit, Visit(_left_out(references, left_out)), alone)
+    together = None if search is None else search(joint)
+    gain = _gain(fit, joint) if alone is None or together is None else _stated_gain(alone, together)
     _log.info("limits with the reference frames are %.2f times deeper than without", gain)
     # Deeper limits of a fit whose errors are not calibrated are no gain over one whose are.
     if gain > 1 and (joint.status.calibrated or not fit.status.calibrated):
         visit = Visit(_contributions(joint, references, left_out, remarks), gain)
-        return Joined(joint, visit, searches and searches[1])
+        return Joined(joint, visit, together)
     reason = (
         f"the fit of all frames ended as {joint.status.name}"
         if gain > 1
         else f"limits would be {1 / gain:.2f} times those without it"
     )
     left_out |= {each.name: reason for each in used}
-    return Joined(fit, Visit(_left_out(references, left_out)), searches and searches[0])
+    return Joined(fit, Visit(_left_out(references, left_out)), alone)
+
+
+def _companions(fit: Refinement, alone: Detection | None) -> tuple[Planet, ...]:
+    """The companions of a fit of the target; all its candidates if one of them is bright."""
+    if alone is None and fit.status.calibrated:
+        # It is not refined with them: that is left to the fit of all frames.
+        alone = detect(fit, relinearise=math.inf)
+    if alone is None or not (np.asarray(alone.candidates["snr"]) > _SHOWN).any():
+        return fit.planets
+    return alone.sources.planets()
 
 
 def _worth_while(references: list[Observation], left_out: dict[str, str]) -> list[Observation]:

@@ -24,6 +24,7 @@ from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, breakd
 from pyklip_diffrender.refinement.forward import Problem, starting_values
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.admission import require_agreement
+from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -193,17 +194,21 @@ def join_frames(
     settings: GaussNewton,
     *,
     systematics: Systematics | None,
+    companions: Sequence[Planet] | None = None,
     progress: bool = False,
 ) -> Refinement:
     """Continue a fit with more frames in its likelihood, such as those of reference stars.
 
     `others` are the new frames, aligned with the fit by `align_frame`; `settings` are those of the
-    fit, with a prior on the drift between frames. Raises `IncompatibleSetupError` if the fit was
-    read from a file without its linear model.
+    fit, with a prior on the drift between frames, and `companions` by default its own. Raises
+    `IncompatibleSetupError` if the fit was read from a file without its linear model.
     """
     # The wavefront of the fit is near that of the new frames. A few steps of all unknowns then take
     # the place of a fit from the map on.
-    settings, reached = continue_from(replace(fit, settings=settings))
+    settings, reached = continue_from(
+        replace(fit, settings=settings),
+        companions=fit.planets if companions is None else tuple(companions),
+    )
     own = (*settings.own, "pedestal")
     count = len(fit.frames)
     warm = {

@@ -708,9 +708,12 @@ class Solver:
         may_repeat = self.settings.accurate_steps and modes > 0
         if not (may_repeat and needs_accurate):
             taken, gain, carried = self._quick_step(state, carried, kappa, modes, may_repeat)
-            if taken is not None:
+            # That no further step gains anything is for the derivatives of the model to say.
+            is_last = may_repeat and gain < self.settings.tolerance and kappa < _FAR
+            if taken is not None and not is_last:
                 return Step(taken, gain, carried)
             carried = replace(carried, damping=0.0, needs_accurate=True)
+            state = state if taken is None else taken
         return self._accurate_step(state, carried, kappa, modes)
 
     # The linearised problem. Let x be the unknowns minus their starting values, J the Jacobian by
