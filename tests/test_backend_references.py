@@ -236,12 +236,10 @@ def maps(tmp_path):
 @pytest.mark.parametrize(
     ("opd", "date", "hours"),
     [
-        ("folder", "2022-08-01", 46.966),
-        (None, "2022-08-01", 46.966),
-        ("closest", "2022-08-01", 46.966),
-        ("before", "2022-07-28", -49.034),
+        ("folder", "2022-08-01", 46.966), (None, "2022-08-01", 46.966),
+        ("closest", "2022-08-01", 46.966), ("before", "2022-07-28", -49.034),
     ],
-)
+)  # fmt: skip
 def test_the_map_of_a_folder_is_chosen_by_the_date(opd, date, hours, maps, files, tmp_path):
     unregister()
     options = {"opd": maps} if opd == "folder" else {"opd": opd, "opd_folder": maps}

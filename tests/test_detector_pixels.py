@@ -133,15 +133,12 @@ def test_a_gap_does_not_spread_when_a_shift_is_undone(tmp_path):
 @pytest.mark.parametrize(
     ("cards", "place"),
     [
-        ({"APERNAME": "NRCA5_FULL_MASK335R"}, True),
-        ({"CORONMSK": "UNKNOWN"}, True),
-        ({"SUBSTRT1": None, "SUBSTRT2": None}, True),
-        ({"SUBSTRT1": 1, "SUBSTRT2": 1}, True),
-        ({"DETECTOR": None, "APERNAME": None}, False),
-        ({"FILTER": "F277W"}, False),
+        ({"APERNAME": "NRCA5_FULL_MASK335R"}, True), ({"CORONMSK": "UNKNOWN"}, True),
+        ({"SUBSTRT1": None, "SUBSTRT2": None}, True), ({"SUBSTRT1": 1, "SUBSTRT2": 1}, True),
+        ({"DETECTOR": None, "APERNAME": None}, False), ({"FILTER": "F277W"}, False),
         ({"CORONMSK": None, "APERNAME": None}, False),
     ],
-)
+)  # fmt: skip
 def test_the_place_of_shifted_frames_is_known_or_left_to_the_search(tmp_path, cards, place):
     got = dr.Observation.from_fits(aligned_file(tmp_path / "a.fits", **cards))
     if not place:

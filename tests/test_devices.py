@@ -270,13 +270,10 @@ DTYPES = (torch.float64, torch.float32)
 @pytest.mark.parametrize(
     ("compute", "tolerances"),
     [
-        (gradient, (1e-9, 2e-4)),
-        (parameter_derivatives, (1e-9, 1e-4)),
-        (point_sources, (1e-5, 1e-5)),
-        (response, (1e-5, 1e-4)),
-        (fit_gradient, (1e-9, 2e-4)),
+        (gradient, (1e-9, 2e-4)), (parameter_derivatives, (1e-9, 1e-4)),
+        (point_sources, (1e-5, 1e-5)), (response, (1e-5, 1e-4)), (fit_gradient, (1e-9, 2e-4)),
     ],
-)
+)  # fmt: skip
 def test_images_and_derivatives_on_a_gpu(compute, tolerances, dtype):
     """As a fraction of the rms; on the processor, single precision is off by up to 1.4e-5.
 

@@ -225,6 +225,18 @@ def test_slow_steps_are_followed_by_accurate_ones(earlier, is_slow):
     assert step(replace(begun, gain=earlier * gain))[2].needs_accurate == is_slow
 
 
+def test_the_last_step_is_an_accurate_one():
+    """One whose gain would end the fit is followed by one with derivatives of the model itself."""
+    solver, state = solver_of(1, accurate_steps=True)
+    arguments = state, StepState(solver.priors_of(solver.settings)), 0.01, len(BASIS)
+    quick = solver.step(*arguments)
+    assert not quick.carried.needs_accurate
+    solver.settings = replace(solver.settings, tolerance=(1 + 1e-9) * quick.gain)
+    last = solver.step(*arguments)
+    assert last.carried.needs_accurate
+    assert last.gain < quick.gain
+
+
 def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner():
     """And end without a step where there is nothing to gain."""
     rng = np.random.default_rng(9)

@@ -75,10 +75,7 @@ def test_the_time_that_is_left_follows_the_stages_that_have_ended(caplog, monkey
         with stage("products"):
             pass
     assert [record.getMessage() for record in caplog.records] == [
-        "1. wavefront, about 2 min left",
-        "1. wavefront, about 40 s left, step 1",
-        "1. wavefront, more than 2 min left, step 2",
-        "2. another fit, about 2 min left",
-        "3. search, about 2 min left",
-        "4. products, about 30 s left",
-    ]
+        "1. wavefront, about 2 min left", "1. wavefront, about 40 s left, step 1",
+        "1. wavefront, more than 2 min left, step 2", "2. another fit, about 2 min left",
+        "3. search, about 2 min left", "4. products, about 30 s left",
+    ]  # fmt: skip

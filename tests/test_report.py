@@ -214,13 +214,11 @@ def test_extended_light_is_told_by_the_arrangement(places, reason):
     [
         (plus_minus, (0.82345, 0.00213), "0.823 ± 0.002"),
         (plus_minus, (149.64, 0.134), "149.64 ± 0.13"),
-        (plus_minus, (149.64, 13.4), "150 ± 13"),
-        (plus_minus, (0.5, float("nan")), "0.500 ± nan"),
-        (scientific, (4.5e-6,), "4.5 × 10⁻⁶"),
-        (scientific, (9.99e-6,), "1.0 × 10⁻⁵"),
+        (plus_minus, (149.64, 13.4), "150 ± 13"), (plus_minus, (0.5, float("nan")), "0.500 ± nan"),
+        (scientific, (4.5e-6,), "4.5 × 10⁻⁶"), (scientific, (9.99e-6,), "1.0 × 10⁻⁵"),
         (scientific, (0.0,), "0"),
     ],
-)
+)  # fmt: skip
 def test_errors_decide_on_the_digits(write, values, text):
     assert write(*values) == text
 

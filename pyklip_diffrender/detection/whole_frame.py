@@ -362,15 +362,17 @@ _WRONG = 0.5
 which a pixel is left out. A source of 0.01 of the star's flux at 3.2 arcsec left four false
 candidates there, and one of 0.1 at 1.5 arcsec residuals of four standard deviations."""
 
-_SHARE = 0.2
+_SHARE = 0.03
 """Brightness of pixels beyond the fitted ones, relative to the brightest of these, from which there
-may be such a source. One of 1e-3 of the star's flux has about that in F444W."""
+may be such a source. Without one it is up to 0.024 in frames of three stars, with one of 7e-5 of
+the star's flux 0.045, and with one of 1e-3 about 0.2."""
 
 _BRIGHT = 50.0
 """Smallest S/N of such a source. The search of whole frames finds the fainter ones."""
 
-_SEEN = 30.0
-"""Smallest S/N of its light in all fitted pixels together."""
+_SEEN = 10.0
+"""Smallest S/N of its light in all fitted pixels together: that of a source of 7e-5 at 3.4 arcsec
+was a candidate of S/N 9 there."""
 
 _SAME = 0.2
 """arcsec between the places of a source in two frames that were aligned roughly."""
