@@ -218,6 +218,7 @@ def with_references(
         drift_cycles=_CYCLES,
         tolerance=max(fit.settings.tolerance, _TOLERANCE),
         adapt_prior=True,
+        marginal_flux=True,
         max_iterations=min(fit.settings.max_iterations, _STEPS),
     )
     if pattern is not None:

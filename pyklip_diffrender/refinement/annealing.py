@@ -280,6 +280,9 @@ _LEAST_SLOPE = 0.2
 the size of the wavefront follows, logarithm of that size which is negligible, and least change of
 it that is believed, relative to that of the scale."""
 
+_MODES = ("amplitude", "modes", "drift")
+"""Names of the unknowns that have a prior of `ModePriors`."""
+
 _EARLY = 1
 """Number of steps of a fit that continues another one, after which the sizes of the wavefront and
 of the drift between frames are measured for the first time."""
@@ -354,6 +357,11 @@ class Annealing:
             self.solver.equations.start_from(known)
             adapted = earlier.settings.adapt_prior or not settings.adapt_prior
             self._has_scales = earlier.status.calibrated and adapted
+            if settings.marginal_flux and earlier.settings.marginal_flux:
+                others = sum(each.name not in _MODES for each in earlier.linear.unknowns)
+                determined = max(0.0, earlier.effective_parameters - others)
+                priors = replace(self._first.priors, determined=determined)
+                self._first = replace(self._first, priors=priors)
 
     def run(self) -> Refinement:
         """Fit the alignment, then alignment and wavefront; return the best iterate."""
@@ -403,7 +411,8 @@ class Annealing:
         )
         course.error = self.objective.model_error(course.state)
         course.chi2 = self.objective.chi2_per_pixel(course.state)
-        if (course.error, course.chi2) < course.least:
+        # Where the flux is marginal, steps may raise chi-squared.
+        if course.carried.priors.determined or (course.error, course.chi2) < course.least:
             course.best, course.least = course.state, (course.error, course.chi2)
         damping = course.carried.damping
         self._record(course.kappa, course.modes, course.chi2, course.error, gain, damping)
@@ -517,6 +526,10 @@ class Annealing:
                 best = self._with_wider_prior(best)
             best = self._with_narrower_prior(best)
             best = self._with_measured_drift(best)
+            if not best.carried.priors.determined:
+                counted = self._counted(best)
+                if counted is not best:
+                    best = self._gone_on(counted, self.settings.max_iterations)
         if best.state.flux <= 0:
             return best, Status.DIVERGED
         if not converged:
@@ -567,8 +580,9 @@ class Annealing:
         if narrowed is not end.settings:
             end = self._with_settings(end, narrowed)
         end, _ = self._with_drift_of(end)
-        if end.settings is not course.settings:
-            course.carried, course.settings = end.carried, end.settings
+        counted = self._counted(end)
+        if end.settings is not course.settings or counted is not end:
+            course.carried, course.settings = counted.carried, end.settings
             # Under a narrower prior the best state has a larger chi-squared.
             course.best, course.least = course.state, NOTHING
 
@@ -604,7 +618,7 @@ class Annealing:
             change = log_size / slope
             amplitude = priors.ratios(update)["amplitude"] ** (1 / slope)
             settings = settings.with_narrower_prior(math.exp(change), amplitude)
-            priors = self.solver.priors_of(settings)
+            priors = self._priors_of(settings, priors)
             update = self.solver.posterior(end.state, priors)
             last, log_size = log_size, math.log(priors.size(update))
             if abs(log_size) < _SAME_SIZE:
@@ -634,6 +648,14 @@ class Annealing:
         change = (end.carried.priors.scales / before.scales).log().abs().max()
         return end, float(change) > _SAME_DRIFT
 
+    def _counted(self, end: _Fitted) -> _Fitted:
+        """Count the modes that the data determine, if the flux is to be marginal."""
+        if not self.settings.marginal_flux or self._unexplained(end.state):
+            return end
+        counted = end.carried.priors.counted(self._posterior(end))
+        _log.info("the data determine %.0f modes", counted.determined)
+        return replace(end, carried=replace(end.carried, priors=counted))
+
     def _posterior(self, end: _Fitted) -> EvidenceUpdate:
         """Errors of all unknowns, with the weights of all pixels and no model error."""
         priors = end.carried.priors
@@ -642,8 +664,12 @@ class Annealing:
 
     def _with_settings(self, end: _Fitted, settings: GaussNewton) -> _Fitted:
         """State of a fit with other settings, and the priors that these state."""
-        carried = replace(end.carried, priors=self.solver.priors_of(settings))
-        return replace(end, carried=carried, settings=settings)
+        priors = self._priors_of(settings, end.carried.priors)
+        return replace(end, carried=replace(end.carried, priors=priors), settings=settings)
+
+    def _priors_of(self, settings: GaussNewton, before: ModePriors) -> ModePriors:
+        """The priors of other settings, with the number of modes of those before."""
+        return replace(self.solver.priors_of(settings), determined=before.determined)
 
     def _gone_on(self, end: _Fitted, steps: int) -> _Fitted:
         """Take more steps of all unknowns, see `_settled`."""

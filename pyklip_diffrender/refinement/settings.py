@@ -61,8 +61,8 @@ _DRIFT_RANGE = 4.0
 """Largest factor between the scale of a drift that maximises the evidence and the one stated."""
 
 _SWITCHES = (
-    "wavefront", "grow_basis", "coarse_first", "adapt_prior", "companions_if_stalled",
-    "accurate_steps",
+    "wavefront", "grow_basis", "coarse_first", "adapt_prior", "marginal_flux",
+    "companions_if_stalled", "accurate_steps",
 )  # fmt: skip
 """Fields of `GaussNewton` that are True or False."""
 
@@ -136,6 +136,9 @@ class GaussNewton:
         continue the fit, up to three times. Where the fitted wavefront is less than 0.8 times as
         large as its prior says, and a map of the wavefront is known, lower them likewise: with a
         prior that is too wide, the star's flux comes out too high.
+    marginal_flux : bool
+        Fit the flux of the star that is most probable after the wavefront is marginalised, and not
+        the most probable pair of both, which is too bright where the data determine many modes.
     drift : WavefrontPrior, optional
         Prior on the difference between the wavefronts of several frames. By default all frames
         share one wavefront.
@@ -210,6 +213,7 @@ class GaussNewton:
     deviations: Mapping[str, float] = field(default_factory=dict)
     prior: WavefrontPrior = field(default_factory=WavefrontPrior)
     adapt_prior: bool = False
+    marginal_flux: bool = False
     drift: WavefrontPrior | None = None
     dither_drift: WavefrontPrior | None = None
     drift_cycles: float = 8.0
@@ -599,6 +603,8 @@ class ModePriors:
     group: Tensor  # (modes + blocks * drift,), int64, index of the group in `names`.
     names: tuple[str, ...]
     scales: Tensor  # (groups,), nm; a step of a fit returns others unless they are fixed.
+    # Number of modes that the data determine, if the flux is to be marginal, see `Solver`; else 0.
+    determined: float = 0.0
 
     @classmethod
     def of(
@@ -654,6 +660,13 @@ class ModePriors:
         """Whether the wavefront is too large for its prior."""
         of_wavefront = [ratios[name] for name in self.names if ratios]
         return max(of_wavefront, default=0.0) >= _IMPROBABLE
+
+    def counted(self, update: EvidenceUpdate) -> ModePriors:
+        """With the number of modes that the data determine."""
+        assert update.variance is not None
+        deviation = self.deviation
+        shares = 1 - update.variance[-len(deviation) :] / deviation**2
+        return replace(self, determined=float(shares.sum()))
 
     def size(self, update: EvidenceUpdate) -> float:
         """Size of the wavefront that all frames share, relative to its prior."""

@@ -129,6 +129,11 @@ def _frame_unknowns(
     return replace(unknowns, start={**unknowns.start, **levels}, deviations=deviations)
 
 
+def _fluxes(state: State) -> list[float]:
+    """Flux of the star in each frame."""
+    return [point.unknowns.level("flux", point.vector) for point in state.points]
+
+
 def _median_flux(problem: Problem, image: Tensor) -> float:
     """Median of the flux by the pixels where the star is bright.
 
@@ -396,6 +401,7 @@ def accurate_step(
     deviation: Tensor,
     enough: float,
     *,
+    volume: Tensor | float = 0.0,
     iterations: int = _ITERATIONS,
     sufficient: float = _SUFFICIENT,
 ) -> tuple[Tensor, bool]:
@@ -403,7 +409,8 @@ def accurate_step(
 
     `curvature` (some, some) is approximate and by the leading unknowns, the only ones that the step
     changes. `offset` (unknowns,) is from the means of the priors, whose standard deviations are
-    `deviation`. The flag and the last arguments are those of `conjugate_gradients`.
+    `deviation`, and `volume` (some,) is added to the gradient. The flag and the last arguments are
+    those of `conjugate_gradients`.
     """
     count = len(curvature)
     # The step s minimises s (A + p) s - 2 s (g - p x0), with the curvature A and gradient g of the
@@ -424,7 +431,7 @@ def accurate_step(
     def precondition(scaled: Tensor) -> Tensor:
         return torch.cholesky_solve(scaled[:, None], factor)[:, 0]
 
-    gradient = derivatives.gradient()[:count] - precision * offset[:count]
+    gradient = derivatives.gradient()[:count] - precision * offset[:count] + volume
     scaled, settled = conjugate_gradients(
         product, precondition, unit * gradient, enough, iterations, sufficient
     )
@@ -796,8 +803,9 @@ class Solver:
                 if forward.problem.observation.reference
             }
             derivatives = ModelDerivatives(objective, state, noise, rough)
+            volume = self._volume_gradient(state, carried.priors, len(equations.curvature))
             step, settled = accurate_step(
-                derivatives, equations.curvature, offset, deviation, enough
+                derivatives, equations.curvature, offset, deviation, enough, volume=volume
             )
             self.equations.judge(preconditions=settled)
             for part in _PARTS:
@@ -904,9 +912,10 @@ class Solver:
         # Unknowns differ by many powers of ten, so the system is solved in scaled units.
         unit = torch.ones(len(curvature), dtype=torch.float64)
         unit[: len(fixed)] = curvature.diagonal()[: len(fixed)].clamp(min=1e-300) ** -0.5
+        gradient = equations.gradient + self._volume_gradient(equations.state, priors, len(unit))
         update = solve_with_evidence(
             (curvature * unit[:, None]).mul_(unit),
-            equations.gradient * unit,
+            gradient * unit,
             priors.shape[:modes],
             priors.group[:modes],
             priors.scales,
@@ -925,7 +934,31 @@ class Solver:
         # weights that were made robust about the state before a step, a step that lowers this sum
         # also lowers the loss.
         offset = (state.vector - state.unknowns.initial()) / deviation
-        return self.objective.chi2(state, noise) + float((offset**2).sum())
+        logs = [math.log(flux) for flux in _fluxes(state) if flux > 0] if priors.determined else []
+        volume = priors.determined * float(np.mean(logs)) if logs else 0.0
+        return self.objective.chi2(state, noise) + float((offset**2).sum()) + volume
+
+    # The flux of the star, marginalised over the wavefront. The data fix the product of the flux F
+    # and the intensity |E|^2 of the diffracted field, so that a brighter star goes with a smaller
+    # wavefront. The derivative of the image by a mode, F |E| up to factors that do not depend on
+    # it, is then in proportion to sqrt(F), and the volume of the n modes that the data determine to
+    # F^(-n / 2). The marginal probability of F has that factor, and the joint one has not: where
+    # the prior pulls the wavefront to 0, the most probable pair has too large a flux. The penalised
+    # chi-squared of a fit with a marginal flux has n log F in addition, with n of
+    # `ModePriors.determined` and the mean of log F over frames, whose ratios the data determine.
+    # See D. J. C. MacKay 1992, Neural Computation 4, 415, for Laplace's approximation.
+
+    @staticmethod
+    def _volume_gradient(state: State, priors: ModePriors, count: int) -> Tensor:
+        """Minus half the derivative of n log F by the first `count` unknowns."""
+        total = torch.zeros(state.unknowns.size, dtype=torch.float64)
+        if not priors.determined:
+            return total[:count]
+        for rows, point in zip(state.unknowns.rows, state.points, strict=True):
+            flux, of_frame = point.unknowns.where("flux"), torch.zeros_like(point.vector)
+            of_frame[flux] = -priors.determined / (2 * len(state.points) * point.vector[flux])
+            total += rows.onto_unknowns(of_frame, len(total))
+        return total[:count]
 
     def _predicted_gain(
         self, unknowns: Unknowns, equations: NormalEquations, priors: ModePriors, step: Tensor
@@ -933,8 +966,9 @@ class Solver:
         """Decrease of the penalised chi-squared if the model were linear."""
         precision = self.prior_deviation(unknowns, priors)[: len(step)] ** -2
         curvature, current = equations.curvature, equations.current
+        gradient = equations.gradient + self._volume_gradient(equations.state, priors, len(step))
 
         def quadratic(x: Tensor) -> float:
-            return float(x @ (curvature @ x) - 2 * equations.gradient @ x + precision @ x**2)
+            return float(x @ (curvature @ x) - 2 * gradient @ x + precision @ x**2)
 
         return max(quadratic(current) - quadratic(step), 1e-12)
