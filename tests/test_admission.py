@@ -624,14 +624,11 @@ EMPTY = {"change": times(SCI=0.0)}
     [
         ({"cards": OTHER}, lambda path: without(path, "SCI")),
         ({"cards": OTHER}, lambda path: without(path, "ERR")),
-        ({"cards": OTHER}, truncated),
-        ({"cards": OTHER | {"DRVERS": "0.1"}}, None),
-        ({"cards": OTHER | {"PSFSUB": "pyKLIP"}}, None),
-        (EMPTY | {"cards": OTHER}, None),
-        (EMPTY | {"cards": {"FILTER": "F356W"}}, None),
-        (EMPTY | {"star": "HD 9"}, None),
+        ({"cards": OTHER}, truncated), ({"cards": OTHER | {"DRVERS": "0.1"}}, None),
+        ({"cards": OTHER | {"PSFSUB": "pyKLIP"}}, None), (EMPTY | {"cards": OTHER}, None),
+        (EMPTY | {"cards": {"FILTER": "F356W"}}, None), (EMPTY | {"star": "HD 9"}, None),
     ],
-)
+)  # fmt: skip
 def test_files_that_cannot_be_used_do_not_vote(folder, facts, spoil):
     names = ["k0.fits", "k1.fits", "k2.fits"]
     for k, name in enumerate(names):

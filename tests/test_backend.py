@@ -159,14 +159,11 @@ def test_other_algorithms_are_bit_identical(algo, imgs, tmp_path):
 @pytest.mark.parametrize(
     ("mode", "wvs", "collapse", "save_ints"),
     [
-        ("ADI", None, "weighted-mean", False),
-        ("RDI", None, "mean", True),
-        ("ADI + RDI", None, "weighted-mean", True),
-        ("ADI+SDI", [4.44] * 3, "mean", False),
-        ("ADI+SDI", [4.0, 4.4] * 3, "weighted-mean", True),
-        ("ADI", [4.0, 4.4] * 3, "mean", True),
+        ("ADI", None, "weighted-mean", False), ("RDI", None, "mean", True),
+        ("ADI + RDI", None, "weighted-mean", True), ("ADI+SDI", [4.44] * 3, "mean", False),
+        ("ADI+SDI", [4.0, 4.4] * 3, "weighted-mean", True), ("ADI", [4.0, 4.4] * 3, "mean", True),
     ],
-)
+)  # fmt: skip
 def test_every_file_keyword_and_slice_is_there_as_klip_leaves_it(
     mode, wvs, collapse, save_ints, imgs, tmp_path
 ):

@@ -113,15 +113,12 @@ ROWS = [
 @pytest.mark.parametrize(
     ("date", "choice", "names", "order"),
     [
-        ("2022-08-11T08:00", "before", [SECOND], 1),
-        ("2022-08-11T08:00", "before", [SECOND], -1),
-        ("2022-08-11T08:00", "closest", [SECOND], 1),
-        ("2022-08-11T02:00", "after", [SECOND], 1),
-        ("2022-08-11T08:00", "after", [LATER], 1),
-        ("2022-08-13T08:00", "nearest", [LATER], 1),
+        ("2022-08-11T08:00", "before", [SECOND], 1), ("2022-08-11T08:00", "before", [SECOND], -1),
+        ("2022-08-11T08:00", "closest", [SECOND], 1), ("2022-08-11T02:00", "after", [SECOND], 1),
+        ("2022-08-11T08:00", "after", [LATER], 1), ("2022-08-13T08:00", "nearest", [LATER], 1),
         ("2022-08-13T08:00", "interpolate", [SECOND, LATER], -1),
     ],
-)
+)  # fmt: skip
 @pytest.mark.filterwarnings("ignore:the wavefront of .* is an interpolation")
 def test_by_date_through_stpsf(wss, tmp_path, monkeypatch, date, choice, names, order):
     """What stpsf leaves out of its tables is not used, and of one sensing the last analysis."""

@@ -227,7 +227,7 @@ def test_slow_steps_are_followed_by_accurate_ones(earlier, is_slow):
 
 def test_the_last_step_is_an_accurate_one():
     """One whose gain would end the fit is followed by one with derivatives of the model itself."""
-    solver, state = solver_of(1, accurate_steps=True)
+    solver, state = solver_of.__wrapped__(1, accurate_steps=True)  # Its settings change.
     arguments = state, StepState(solver.priors_of(solver.settings)), 0.01, len(BASIS)
     quick = solver.step(*arguments)
     assert not quick.carried.needs_accurate
@@ -235,6 +235,24 @@ def test_the_last_step_is_an_accurate_one():
     last = solver.step(*arguments)
     assert last.carried.needs_accurate
     assert last.gain < quick.gain
+
+
+def test_a_marginal_flux_counts_the_volume_of_the_wavefront():
+    """The penalty is n log F, which steps know, so that the star is fainter."""
+    solver, state = solver_of(2)
+    plain = solver.priors_of(solver.settings)
+    counted, noise = replace(plain, determined=5e3), solver.objective.errors(state, 0.01, 4.0)
+    gradient = solver._volume_gradient(state, counted, state.unknowns.size)
+    step = 1e-4 * state.vector * (gradient != 0)
+    ahead = solver.objective.at(state.unknowns, state.vector + step)
+    before, after = (
+        solver._cost(each, noise, counted) - solver._cost(each, noise, plain)
+        for each in (state, ahead)
+    )
+    assert after - before == pytest.approx(5e3 * np.log(1.0001), rel=1e-3)
+    assert float(-2 * gradient @ step) == pytest.approx(after - before, rel=1e-3)
+    taken = [solver.step(state, StepState(each), 0.01, len(BASIS)) for each in (plain, counted)]
+    assert 0.5 * taken[0].state.flux < taken[1].state.flux < 0.99 * taken[0].state.flux
 
 
 def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner():

@@ -192,12 +192,10 @@ def test_a_reduction_takes_the_nearest_map_of_a_folder(folder):
         ({"DATE-BEG": "2022-08-11T04:00:00"}, "opd_2022-08-14", "2022-08-11T04:00:00"),
         ({}, "opd_2022-08-14.fits.gz", "2022-08-14T00:00:00"),
         ({}, "R2022081402-NRCA3_FP1-1.fits", "2022-08-14T00:00:00"),
-        ({}, "opd_20220814.fits", "2022-08-14T00:00:00"),
-        ({}, "jw0120220814.fits", None),
-        ({}, "opd_2022-19-39.fits", None),
-        ({}, "opd.fits", None),
+        ({}, "opd_20220814.fits", "2022-08-14T00:00:00"), ({}, "jw0120220814.fits", None),
+        ({}, "opd_2022-19-39.fits", None), ({}, "opd.fits", None),
     ],
-)
+)  # fmt: skip
 def test_dates_of_maps(cards, name, expected):
     date = sensing_date(fits.Header(cards), name)
     assert (date and date.isot[:19]) == expected

@@ -129,12 +129,10 @@ def mask_and_place(aperture):
 @pytest.mark.parametrize(
     ("aperture", "band", "wavelength"),
     [
-        ("NRCA5_FULL_MASK335R", "F444W", 4.5e-6),
-        ("NRCB1_MASK210R", "F200W", 2.0e-6),
-        ("NRCA4_FULL_MASKSWB_F200W", "F200W", 2.0e-6),
-        ("NRCB5_MASKLWB", "F444W", 4.5e-6),
+        ("NRCA5_FULL_MASK335R", "F444W", 4.5e-6), ("NRCB1_MASK210R", "F200W", 2.0e-6),
+        ("NRCA4_FULL_MASKSWB_F200W", "F200W", 2.0e-6), ("NRCB5_MASKLWB", "F444W", 4.5e-6),
     ],
-)
+)  # fmt: skip
 def test_the_embedded_occulter_is_that_of_stpsf(stpsf_path, aperture, band, wavelength):
     """On and off the axis, everything else being stpsf's, cells of 1/4 lambda/D in both."""
     # On the axis the image is 1e3 to 1e5 times fainter, and errors are stated of that. The ends of

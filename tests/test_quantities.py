@@ -74,10 +74,8 @@ CASES = {
         "background": (2 * u.photon, 2),
     }),
     "nircam_coronagraph, one wavelength": (coronagraph, {
-        "monochromatic": (4.5 * u.um, 4.5e-6),
-        "pixelscale": (63 * u.mas, 0.063),
-        "segment_gap": (7 * u.mm, 0.007),
-        "chromatic_reference": (3350 * u.nm, 3.35e-6),
+        "monochromatic": (4.5 * u.um, 4.5e-6), "pixelscale": (63 * u.mas, 0.063),
+        "segment_gap": (7 * u.mm, 0.007), "chromatic_reference": (3350 * u.nm, 3.35e-6),
         "si_wfe": (np.linspace(-9, 9, 36) * u.nm, np.linspace(-9e-9, 9e-9, 36)),
     }),
     "nircam_coronagraph, field and source": (coronagraph, {
@@ -116,10 +114,8 @@ CASES = {
         "position_angles": ([0.5, 0.6] * u.rad, np.degrees([0.5, 0.6])),
     }),
     "refine, start": (problem, {
-        "star_offset": ([10, -20] * u.mas, (0.01, -0.02)),
-        "lyot_rotation": (6 * u.arcmin, 0.1),
-        "flux": (2e6 * u.Jy / u.sr, 2.0),
-        "background": (3e3 * u.Jy / u.sr, 0.003),
+        "star_offset": ([10, -20] * u.mas, (0.01, -0.02)), "lyot_rotation": (6 * u.arcmin, 0.1),
+        "flux": (2e6 * u.Jy / u.sr, 2.0), "background": (3e3 * u.Jy / u.sr, 0.003),
     }),
 }  # fmt: skip
 """A call, and its arguments as Quantities and as numbers in the units of the interface."""
