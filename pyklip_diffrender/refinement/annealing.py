@@ -650,7 +650,8 @@ class Annealing:
 
     def _counted(self, end: _Fitted) -> _Fitted:
         """Count the modes that the data determine, if the flux is to be marginal."""
-        if not self.settings.marginal_flux or self._unexplained(end.state):
+        wanted = self.settings.marginal_flux and self.settings.wavefront
+        if not wanted or self._unexplained(end.state):
             return end
         counted = end.carried.priors.counted(self._posterior(end))
         _log.info("the data determine %.0f modes", counted.determined)
