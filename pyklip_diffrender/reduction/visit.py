@@ -223,7 +223,7 @@ def with_references(
     )
     if pattern is not None:
         settings = with_known_pattern(settings)
-    alone = None if search is None else search(fit)
+    alone = search(fit) if search is not None and used else None
     companions = _companions(fit, alone) if used else ()
     joint: Refinement | None = None
     remarks: dict[str, str] = {}
