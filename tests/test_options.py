@@ -104,16 +104,12 @@ def test_no_default_is_repeated():
     ("name", "value", "words"),
     [
         ("size", 7, "7, expected a whole number of pixels, 8 or more"),
-        ("size", 80.5, "8 or more"),
-        ("injections", True, "a whole number, 0 or more"),
-        ("threshold", float("inf"), "a positive number"),
-        ("threshold", None, "a positive number"),
-        ("wide", "no", "'no', expected true or false"),
-        ("references", "both", "one of joint, pattern, off"),
-        ("star_flux_error", 5, "0.05 for 5 %"),
-        ("max_chi2", 0, "inf for no limit"),
+        ("size", 80.5, "8 or more"), ("injections", True, "a whole number, 0 or more"),
+        ("threshold", float("inf"), "a positive number"), ("threshold", None, "a positive number"),
+        ("wide", "no", "'no', expected true or false"), ("max_chi2", 0, "inf for no limit"),
+        ("references", "both", "one of joint, pattern, off"), ("star_flux_error", 5, "0.05 for 5 %"),
     ],
-)
+)  # fmt: skip
 def test_values_that_are_not_allowed(name, value, words):
     with pytest.raises(IncompatibleSetupError, match=f"^{name}: got.*{words}"):
         ReduceOptions(**{name: value})

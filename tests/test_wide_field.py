@@ -96,10 +96,14 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit():
         for planets in ((), (source,))
     )
     cut = frame.cutout(FITTED)
-    assert has_bright_pixels_beyond(frame, cut) > has_bright_pixels_beyond(alone, cut)
+    assert has_bright_pixels_beyond(frame, cut)
     settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False)
-    whole, fitted = (Sequence("HD 1", (each,)) for each in (frame, cut))
-    run = _Run(Preparation(whole, fitted, model(FITTED), opd, ReduceOptions(), settings), False)
+    run, other = (
+        _Run(Preparation(Sequence("HD 1", (whole,)), Sequence("HD 1", (whole.cutout(FITTED),)),
+                         model(FITTED), opd, ReduceOptions(), settings), False)
+        for whole in (frame, alone)
+    )  # fmt: skip
+    assert other._beyond == ()
     (known,) = run._beyond
     assert known.contrast == pytest.approx(3e-3, rel=0.1)
     assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05

@@ -362,10 +362,10 @@ _WRONG = 0.5
 which a pixel is left out. A source of 0.01 of the star's flux at 3.2 arcsec left four false
 candidates there, and one of 0.1 at 1.5 arcsec residuals of four standard deviations."""
 
-_SHARE = 0.03
+_SHARE, _OUTER_SHARE, _OUTER = 0.2, 0.03, 3.0
 """Brightness of pixels beyond the fitted ones, relative to the brightest of these, from which there
-may be such a source. Without one it is up to 0.024 in frames of three stars, with one of 7e-5 of
-the star's flux 0.045, and with one of 1e-3 about 0.2."""
+may be such a source, near the star and from a separation on, arcsec. One of 1e-3 of the star's flux
+has about 0.2, and one of 7e-5 has 0.045; without one, frames of three stars have up to 0.024."""
 
 _BRIGHT = 50.0
 """Smallest S/N of such a source. The search of whole frames finds the fainter ones."""
@@ -402,10 +402,12 @@ def has_bright_pixels_beyond(whole: Observation, cut: Observation) -> bool:
     inside = _pixels_inside(whole, cut)
     x, y = np.indices(smooth.shape)[::-1] - whole.center[0][:, None, None]
     scale_x, scale_y = whole.pixelscale
-    # Nearer to the star it is the brightest itself.
-    outside = np.where(np.hypot(scale_x * x, scale_y * y) > _CORE, smooth, 0.0)
-    outside[inside] = 0.0
-    return bool(outside[EDGE:-EDGE, EDGE:-EDGE].max(initial=0.0) > _SHARE * smooth[inside].max())
+    away = np.hypot(scale_x * x, scale_y * y)
+    share = np.where(away > _OUTER, _OUTER_SHARE, _SHARE)
+    share[away <= _CORE] = np.inf  # Here the star is the brightest itself.
+    share[inside] = np.inf
+    outside = smooth > share * smooth[inside].max()
+    return bool(outside[EDGE:-EDGE, EDGE:-EDGE].any())
 
 
 def without_blurred_edges(whole: Observation, cut: Observation) -> Observation:
