@@ -107,7 +107,7 @@ def test_no_default_is_repeated():
         ("size", 80.5, "8 or more"), ("injections", True, "a whole number, 0 or more"),
         ("threshold", float("inf"), "a positive number"), ("threshold", None, "a positive number"),
         ("wide", "no", "'no', expected true or false"), ("max_chi2", 0, "inf for no limit"),
-        ("references", "both", "one of joint, pattern, off"), ("star_flux_error", 5, "0.05 for 5 %"),
+        ("references", "both", "one of joint, pattern, off"), ("star_flux_error", 5, "0.05 for 5"),
     ],
 )  # fmt: skip
 def test_values_that_are_not_allowed(name, value, words):
