@@ -88,27 +88,47 @@ def crowded():
     return detection, frame, wide_field(detection, [frame])
 
 
-def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit():
-    """Its lobes are 27 times the noise of each pixel, and a fit of the star alone never ends."""
-    source, opd = dr.Planet(3e-3, separation=2.1, position_angle=200.0), dr.random_opd(1, npix=128)
+def prepared_run(whole, size, settings):
+    cut, opd = whole.cutout(size), dr.random_opd(1, npix=128)
+    sequences = Sequence("HD 1", (whole,)), Sequence("HD 1", (cut,))
+    run = _Run(Preparation(*sequences, model(size), opd, ReduceOptions(), settings), False)
+    choice = choose_systematics((cut,), (), model(size), opd, settings=settings)
+    return run, lambda: run._fit((cut,), choice)
+
+
+@pytest.mark.parametrize(
+    ("whole", "size", "contrast", "separation"), [(WHOLE, FITTED, 3e-3, 2.1), (144, 80, 1e-4, 3.2)]
+)
+def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit(
+    whole, size, contrast, separation
+):
+    """The first one's lobes are 27 times the noise, and a fit of the star alone never ends."""
+    source, opd = dr.Planet(contrast, separation, position_angle=200.0), dr.random_opd(1, npix=128)
     alone, frame = (
-        dr.simulate(model(WHOLE), dr.Scene(STAR, planets=planets), opd, seed=5)
+        dr.simulate(model(whole), dr.Scene(STAR, planets=planets), opd, seed=5)
         for planets in ((), (source,))
     )
-    cut = frame.cutout(FITTED)
-    assert has_bright_pixels_beyond(frame, cut)
+    assert has_bright_pixels_beyond(frame, frame.cutout(size))
     settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False)
-    run, other = (
-        _Run(Preparation(Sequence("HD 1", (whole,)), Sequence("HD 1", (whole.cutout(FITTED),)),
-                         model(FITTED), opd, ReduceOptions(), settings), False)
-        for whole in (frame, alone)
-    )  # fmt: skip
-    assert other._beyond == ()
+    assert prepared_run(alone, size, settings)[0]._beyond == ()
+    run, fitted = prepared_run(frame, size, settings)
     (known,) = run._beyond
-    assert known.contrast == pytest.approx(3e-3, rel=0.1)
+    assert known.contrast == pytest.approx(contrast, rel=0.1)
     assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05
-    fit = run._fit((cut,), choose_systematics((cut,), (), model(FITTED), opd, settings=settings))
-    assert fit.companions[0, 0] == pytest.approx(3e-3, rel=0.01)
+    assert fitted().companions[0, 0] == pytest.approx(contrast, rel=0.01)
+
+
+def test_a_faint_source_at_the_edges_of_the_fitted_pixels_is_fitted_with_the_star():
+    """A fit without it has three candidates that are no source."""
+    source, opd = dr.Planet.from_offset(1e-5, 1.57, 0.3), dr.random_opd(1, npix=128)
+    for planets in ((), (source,)):
+        frame = dr.simulate(model(WHOLE), dr.Scene(STAR, planets=planets), opd, seed=5)
+        fit = prepared_run(frame, FITTED, dr.GaussNewton(cycles=8))[1]()
+        assert fit.status.name == "CONVERGED"
+        assert len(fit.companions) == len(planets)
+        assert len(dr.detect(fit).candidates) == len(planets)
+    np.testing.assert_allclose(fit.companions[0, 1:], source.offset, atol=0.01)
+    assert fit.companions[0, 0] == pytest.approx(1e-5, rel=0.1)
 
 
 def test_pixels_that_light_from_beyond_blurs_into_are_left_out():

@@ -31,6 +31,7 @@ from pyklip_diffrender.detection.sky_map import Hypotheses, Motion, SkyMap, hypo
 from pyklip_diffrender.detection.templates import combine_frames
 from pyklip_diffrender.detection.whole_frame import (
     has_bright_pixels_beyond,
+    sources_at_edges,
     sources_beyond,
     without_blurred_edges,
 )
@@ -63,6 +64,7 @@ __all__ = [
     "metrics",
     "recover_planets",
     "require_outer_pixels",
+    "sources_at_edges",
     "sources_beyond",
     "sources_of_references",
     "wide_field",

@@ -25,6 +25,7 @@ from pyklip_diffrender.detection import (
     has_bright_pixels_beyond,
     recover_planets,
     require_outer_pixels,
+    sources_at_edges,
     sources_beyond,
     wide_field,
     without_blurred_edges,
@@ -638,10 +639,24 @@ class _Run:
             progress=self.progress,
         )
         self._require_plausible(fit)
+        fit = self._with_sources_at_edges(fit)
         if options.star_flux is None:
             return fit
         flux, error = to_jansky(options.star_flux), options.star_flux_error
         return with_star_flux(fit, flux, error, progress=self.progress)
+
+    def _with_sources_at_edges(self, fit: Refinement) -> Refinement:
+        """Fit the star again with the sources that begin just beyond the fitted pixels."""
+        sources = sources_at_edges(fit, self.preparation.whole.science)
+        if not sources:
+            return fit
+        for each in sources:
+            _log.info(
+                "a source just beyond the fitted pixels is fitted with the star: contrast %.2g, "
+                "%.2f arcsec from it", each.contrast, each.separation,
+            )  # fmt: skip
+        with stage("sources just beyond the fitted pixels"):
+            return refine_again(fit, companions=(*fit.planets, *sources), progress=self.progress)
 
     @property
     def _joining(self) -> tuple[Observation, ...]:
