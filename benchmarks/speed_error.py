@@ -35,6 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from astropy.table import Table
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
@@ -408,40 +409,48 @@ def as_table(points: Sequence[Point], command: str) -> Table:
 def draw(table: Table) -> Figure:
     """Error against time, a panel for images, gradients and fits, a line for each way."""
     shown = [what for what in TITLES if what in set(table["what"])]
-    colors = {way: f"C{k}" for k, way in enumerate(dict.fromkeys(map(str, table["way"])))}
-    columns = 3 if len(shown) in (3, 5, 6) else 2
-    count = -(-len(shown) // columns)
-    figure = Figure(figsize=(5 * columns, 4.8 * count), layout="constrained")
-    panels = figure.subplots(count, columns, squeeze=False).flat
-    for ax in list(panels)[len(shown) :]:
+    ways = dict.fromkeys(map(str, table["way"]))
+    colors = {way: f"C{k}" if k < 10 else f"{k / 10 - 1}" for k, way in enumerate(ways)}
+    count = len(shown) // 2 + 1
+    figure = Figure(figsize=(9, 4.2 * count), layout="constrained")
+    *panels, last = figure.subplots(count, 2, squeeze=False).flat
+    handles: dict[str, Artist] = {}
+    for ax in panels[len(shown) :]:
         ax.set_axis_off()
-    for ax, what in zip(figure.axes, shown, strict=False):
+    for ax, what in zip(panels, shown, strict=False):
         rows = table[table["what"] == what]
-        for way in dict.fromkeys(map(str, rows["way"])):
-            line = rows[rows["way"] == way]
+        ax.margins(0.2)
+        lines = {way: rows[rows["way"] == way] for way in dict.fromkeys(map(str, rows["way"]))}
+        for way, line in lines.items():
             ours = not way.startswith(_OTHERS)
-            # The setting of a single point is part of the name of its way.
-            alone = str(line["setting"][0]) if len(line) == 1 else ""
-            ax.loglog(
-                line["seconds"], np.maximum(line["error"], 1e-16), "o-" if ours else "s--",
-                color=colors[way], label=", ".join(filter(None, [way, alone])), ms=6,
+            errors = np.maximum(line["error"], 1e-16)
+            (handles[way],) = ax.loglog(
+                line["seconds"], errors, "o-" if ours else "s--", color=colors[way], ms=6,
                 mfc=None if ours else "none",
             )  # fmt: skip
-            for row in line[[0, -1]] if len(line) > 1 else ():
+            # Labels are above their points, but for those that would be on others.
+            is_lowest = errors[-1] == min(other["error"][-1] for other in lines.values())
+            is_right_of_another = any(
+                other["seconds"][0] < line["seconds"][0]
+                and abs(other["error"][0] / errors[0] - 1) < 0.2
+                for other in lines.values()
+            )
+            ends = {len(line) - 1: is_lowest} | {0: is_right_of_another}
+            for each, below in ends.items():
                 ax.annotate(
-                    str(row["setting"]), (row["seconds"], max(row["error"], 1e-16)),
-                    xytext=(6, -10), textcoords="offset points", fontsize=7,
+                    str(line["setting"][each]), (line["seconds"][each], errors[each]),
+                    xytext=(5, -11 if below else 4), textcoords="offset points", fontsize=8,
                 )  # fmt: skip
         ax.set(title=TITLES[what], xlabel="time (s)", ylabel=UNITS[what])
         if "sigma" in UNITS[what]:
             # The noise of a pixel.
             ax.axhline(1.0, color="0.7", lw=1, zorder=0)
-        ax.margins(0.2)
-        if max(ax.get_xlim()) < 20 * min(ax.get_xlim()):
+        left, right = ax.get_xlim()
+        ax.set_xlim(left, right * (right / left) ** 0.2)  # For the labels.
+        if right < 20 * left:
             ax.xaxis.set_minor_formatter(ScalarFormatter())
-        ax.legend(
-            fontsize=7, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.08), ncols=2
-        )
+    last.set_axis_off()
+    last.legend(list(handles.values()), list(handles), loc="center left", frameon=False)
     return figure
 
 
