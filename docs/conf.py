@@ -134,9 +134,10 @@ _NUMBER = re.compile(r"(\(?[+-]?(?<![\w.])\d[\d.]*(?:e-?\d+)?(?: \+- [\d.e-]+)?(
 
 
 def _mark_short_cells(app, doctree):
-    """Tell the style sheet which cells and numbers of tables are not broken."""
+    """Tell the style sheet which cells, options and numbers of tables are not broken."""
     for cell in doctree.findall(entry):
-        if len(cell.astext()) < 10:
+        content = cell.astext()
+        if len(content) < 10 or (content.startswith("--") and " " not in content):
             cell["classes"].append("short")
             continue
         for text in list(cell.findall(Text)):

@@ -511,9 +511,10 @@ def _point_sources(
     """
     allowed = frame.searches(frame.grid)
     allowed[inside] = False
-    image = frame.residual
-    least = _BRIGHT
     sources: list[Image] = []
+    if not allowed.any():
+        return sources
+    image, least = frame.residual, _BRIGHT
     while allowed.any() and len(sources) < _MOST:
         numerator, information = frame.products(image)
         snr = np.where(allowed, numerator / np.sqrt(np.maximum(information, 1e-300)), 0.0)
