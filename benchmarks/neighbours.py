@@ -172,8 +172,9 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
     nearest = away(sources[:, 1:], without.grid.reshape(-1, 2)).argmin(axis=-1)
     limits = detection.threshold * without.error.ravel()[nearest]
     half = np.abs(without.grid).max()
-    seen = sources[(sources[:, 0] > limits) & (np.abs(sources[:, 1:]).max(axis=1) < half)]
-    shown = seen if len(sources) > 1 else sources
+    is_shown = (sources[:, 0] > limits) & (np.abs(sources[:, 1:]).max(axis=1) < half)
+    is_shown |= len(sources) == 1
+    shown = sources[is_shown]
     resolution = reduction.fit.model.resolution
     far = (away(detection.grid, shown[:, 1:]) > 1.5 * resolution).all(axis=-1)
     far &= (np.hypot(*np.moveaxis(detection.grid, -1, 0)) > 0.3) & np.isfinite(detection.error)
@@ -197,7 +198,8 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
     scatter = np.nanstd(np.clip(detection.residual_snr[far], -5, 5))
     return row | {
         "status": reduction.fit.status.name, "chi2": float(reduction.fit.chi2_per_pixel),
-        "star": flux / before, "visible": len(shown), "found": len(found), "false": false,
+        "star": flux / before, "visible": len(shown), "false": false,
+        "found": int(is_shown[list(found)].sum()),
         "companions": len(reduction.fit.planets),
         "limits": float(np.nanmedian(ratio)), "limits_90": float(np.nanpercentile(ratio, 90)),
         "limits_10": float(np.nanpercentile(ratio, 10)), "scatter": float(scatter),
