@@ -58,10 +58,10 @@ FAINTEST, SLOPE = (5e-7, 1e-3), 0.75
 def sources_of(case: tuple[float, float]) -> NDArray[Any]:
     """Contrast and x, y in arcsec of the sources of a case, (k, 3).
 
-    It is the contrast and separation of one source; or nan and the number of a field of stars.
+    It is the contrast and separation of one source; or 0 and the number of a field of stars.
     """
     contrast, separation = case
-    if np.isfinite(contrast):
+    if contrast:
         return np.array([[contrast, *dr.Planet(contrast, separation, ANGLE).offset]])
     rng = np.random.default_rng(int(separation))
     places = rng.uniform(-FIELD / 2, FIELD / 2, (STARS, 2))
@@ -224,7 +224,7 @@ def main() -> None:
         pairs = (case.split(",") for case in options.cases)
         cases = [(float(contrast), float(separation)) for contrast, separation in pairs]
     if options.fields:
-        cases = [(np.nan, float(number)) for number in range(options.fields)]
+        cases = [(0.0, float(number)) for number in range(options.fields)]
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     sequence = dr.Sequence.from_files(sorted(options.frames.glob(NAMES)))

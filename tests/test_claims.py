@@ -157,7 +157,7 @@ LIMITS, IMAGES, DISKS = "real_pairs_limits", "real_pairs_images", "disk_limits"
 README, PAPER, PAGE = "README.md", "paper/paper.md", "docs/validation/real_frames.md"
 HOWTO, RESOURCES = "docs/howto/real_frames.md", "docs/howto/resources.md"
 CALIBRATION, DEMO = "docs/validation/calibration.md", "docs/validation/demo.md"
-SPEED = "docs/validation/speed_error.md"
+SPEED, REFERENCES = "docs/validation/speed_error.md", "docs/validation/references.md"
 
 
 def _claims():
@@ -175,6 +175,7 @@ def _claims():
     demo = [1e6 * stated("demo: contrast"), 1e6 * stated("demo: contrast", "error")]
     snr = stated("S/N of the companion")
     visits = [{"visit": k} for k in (0, 1)]
+    scatter = np.prod([table("visits_null")[name] for name in ("scatter", "factor")], axis=0)
     ours, pages = "klip_over_ours_raw", of_pairs(IMAGES, "ratio")
     yield from (
         (README, "has S/N {:.1f} and a contrast of {:.2f}e-6 +- {:.2f}e-6.",
@@ -263,6 +264,17 @@ def _claims():
         (PAGE, "| this package | {:.4f} +- {:.4f} | {:.2f}e-4 +- {:.2f}e-4 |", hip),
         (PAGE, "L20) | {:.3f} +- {:.3f} | {:.2f}e-4 +- {:.2f}e-4 |", published),
         # -- other pages
+        *((HOWTO, f"| {name} | {{:.2f}} | {{:.2f}} | {{:.2f}} | {{:.2f}} |",
+           list(rows("neighbours", contrast=0.1)[column]))
+          for name, column in (("limits over those without it, median", "limits"),
+                               ("of which photon noise", "photon_limits"),
+                               ("reduced chi-squared (0.77 without it)", "chi2"))),
+        *((HOWTO, phrase, [f(rows("neighbours", contrast=contrast)[column]) for f in (min, max)])
+          for phrase, contrast, column in (
+              ("contrast of a binary of 0.1 is {:.2f} to {:.2f} times", 0.1, "measured"),
+              ("Limits are {:.2f} to {:.2f} times those without the field", 0.0, "limits"))),
+        (REFERENCES, "mean (least, greatest) | {:.3f} ({:.2f}, {:.2f}) |",
+         [f(scatter) for f in (np.mean, min, max)]),
         *((CALIBRATION, f"| {hours} | {{:.3f}} | {{:.3f}} | {{:.3f}} |", calibration(hours))
           for hours in (0, 3, 40, 86, 200)),
         *((CALIBRATION, f"| {name} | {{:{form}f}} +- {{:{form}f}} | {{:+.2f}} +- {{:.2f}} "

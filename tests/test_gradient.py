@@ -28,10 +28,7 @@ SCALES = {"segment": 20.0, "texture": 20.0}
 
 @cache
 def solver_of(frames, **changes):
-    """A solver and a state away from the solution, for frames in three wavelengths.
-
-    All frames show the same pixels, with a pattern of which little is known.
-    """
+    """A solver and a state far from the solution, for frames of the same pixels with a pattern."""
     rng = np.random.default_rng(4)
     model = dr.nircam_coronagraph("F444W", nlambda=3, npix=NPIX, fov_pixels=SIZE)
     opd = dr.random_opd(3, npix=NPIX)

@@ -1,7 +1,4 @@
-"""The table of parity with stpsf, at 256 samples across the pupil, and on STScI's own files.
-
-`benchmarks/parity.py` measures the same at 1024 and writes reports/parity.md.
-"""
+"""Parity with stpsf at 256 samples across the pupil; `benchmarks/parity.py` has 1024."""
 
 import numpy as np
 import pytest
