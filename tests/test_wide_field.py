@@ -118,9 +118,12 @@ def test_a_faint_source_at_the_edges_of_the_fitted_pixels_is_fitted_with_the_sta
     source, opd = dr.Planet.from_offset(1e-5, 1.57, 0.3), dr.random_opd(1, npix=128)
     for planets in ((), (source,)):
         frame = dr.simulate(model(WHOLE), dr.Scene(STAR, planets=planets), opd, seed=5)
-        result = run_of(frame, FITTED, cycles=8).result()
+        run = run_of(frame, FITTED, cycles=8)
+        result = run.result()
         assert len(result.fit.companions) == len(result.detection.candidates) == len(planets)
     assert result.fit.companions[0] == pytest.approx([1e-5, *source.offset], rel=0.1)
+    failed = replace(result.fit, status=dr.Status.DIVERGED, companions=np.zeros((0, 3)))
+    assert run._with_sources_at_edges(failed) is failed
 
 
 def test_pixels_that_light_from_beyond_blurs_into_are_left_out():

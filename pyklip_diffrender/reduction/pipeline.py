@@ -647,7 +647,9 @@ class _Run:
 
     def _with_sources_at_edges(self, fit: Refinement) -> Refinement:
         """Fit the star again with the sources that begin just beyond the fitted pixels."""
-        sources = sources_at_edges(fit, self.preparation.whole.science)
+        # A fit that has failed has no star beyond its pixels.
+        usable = fit.status.usable
+        sources = sources_at_edges(fit, self.preparation.whole.science) if usable else ()
         if not sources:
             return fit
         for each in sources:
