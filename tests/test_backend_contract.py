@@ -28,10 +28,7 @@ from pyklip_diffrender.pyklip_backend.patch import spawned_beside_klip
 
 
 class PipelineData(Data):
-    """A dataset of images in memory, as corgidrp makes it: its own attributes, library and files.
-
-    Only what `Data` demands is there: no headers, and none of the attributes of `GenericData`.
-    """
+    """A dataset in memory, as corgidrp makes it, with what `Data` demands and no headers."""
 
     # What `Data` declares abstract: each pipeline stores it as it likes.
     input = centers = filenums = filenames = PAs = wvs = wcs = IWA = output = None

@@ -1,7 +1,4 @@
-"""All work on an accelerator: nothing mixes devices, and the results are the processor's.
-
-The device is pretended, see `pretend_device`; ``python -m pytest -m gpu`` runs on a real one.
-"""
+"""All work on an accelerator, a pretended one (`pretend_device`) or with ``-m gpu`` a real one."""
 
 from dataclasses import replace
 from functools import cache

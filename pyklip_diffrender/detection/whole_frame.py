@@ -395,7 +395,7 @@ _SEEN_AT_EDGE = 5.0
 """Smallest S/N of its light in all fitted pixels of a frame."""
 
 _UNLIKE = 4.0
-"""Largest reduced chi-squared of a faint source there: side lobes of another one have 15 to 20, and
+"""Largest reduced chi-squared of a faint source there: side lobes of another one have 15 to 22, and
 stars 1.5 to 2."""
 
 
