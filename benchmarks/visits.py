@@ -13,8 +13,9 @@ to twice as bright as the target; some have another spectral type, a companion, 
 their header says.
 
 Writes ``visits.ecsv`` with a row for every visit: planets that were found and missed, false
-candidates, pulls, scatter of the S/N, the star's flux over the true one, and limits over those of a
-fit without references, in units of flux. With ``--null`` the visits have no planets and are reduced
+candidates, scatter of the S/N, the star's flux over the true one, and limits over those of a fit
+without references, in units of flux; and ``visit_planets.ecsv`` with the pulls of every planet that
+was found. With ``--null`` the visits have no planets and are reduced
 with their references only, because planets that are not found widen the scatter of the S/N.
 """
 
@@ -208,10 +209,15 @@ def reduced(visit: Visit, folder: Path) -> dict[str, Any]:
             "deeper": float(np.median(ratio)), "deeper_least": float(np.min(ratio)),
             "over_known": joint["limits_over_known_star"],
             "star_alone": stars["off"], "cpu_alone": seconds["off"],
-            # With the S/N as the error of a flux, which does not contain that of the star's.
-            "pulls": [value for each in planets
-                      for value in (each["flux_pull"], each["separation_pull"], each["angle_pull"],
-                                    each["snr"] * (1 - 1 / (each["ratio"] * stars["joint"])))],
+            "planets": [
+                {"visit": visit.number, "contrast": each["contrast"],
+                 "separation": each["separation"], "snr": each["snr"],
+                 "contrast_pull": each["flux_pull"], "separation_pull": each["separation_pull"],
+                 "angle_pull": each["angle_pull"],
+                 # With the S/N as the error of a flux, which does not contain that of the star's.
+                 "flux_pull": each["snr"] * (1 - 1 / (each["ratio"] * stars["joint"]))}
+                for each in planets
+            ],
         }  # fmt: skip
     done.write_text(json.dumps(result, indent=2), encoding="utf-8")
     return result
@@ -244,15 +250,16 @@ def main() -> None:
     with ProcessPoolExecutor(options.jobs, mp_context=context) as pool:
         for result in pool.map(_run, listed, folders):
             rows.append(result)
-            print({k: v for k, v in result.items() if k != "pulls"}, flush=True)
+            print({k: v for k, v in result.items() if k != "planets"}, flush=True)
     whole = [row for row in rows if "chi2" in row]
-    table = Table({name: [row[name] for row in whole] for name in whole[0] if name != "pulls"})
-    if not options.null:
-        pulls = np.array([pull for row in whole for pull in row["pulls"]]).reshape(-1, 4)
-        names = ("contrast", "separation", "angle", "flux")
-        rms = np.sqrt((pulls**2).mean(axis=0)).tolist()
-        table.meta["pulls_rms"] = dict(zip(names, rms, strict=True))
-        print(table.meta["pulls_rms"], len(pulls))
+    planets = [planet for row in whole for planet in row.pop("planets", ())]
+    table = Table(whole)
+    if planets:
+        found = Table(planets)
+        found.write(options.output / "visit_planets.ecsv", overwrite=True)
+        for name in ("contrast_pull", "separation_pull", "angle_pull", "flux_pull"):
+            pull = np.asarray(found[name])
+            print(name, "rms", np.sqrt(np.mean(pull**2)), "mean", pull.mean(), len(pull))
     table.write(options.output / "visits.ecsv", overwrite=True)
     scatter = np.asarray(table["scatter"] * table["factor"])
     print("scatter before it is scaled", scatter.mean(), scatter.min(), scatter.max())

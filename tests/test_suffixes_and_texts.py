@@ -110,10 +110,6 @@ WAVELENGTH, FLUX = np.arange(1, 7.0), np.array([2, 0.8, 0.4, 0.3, 0.2, 0.1])
 ROWS = ["1 2", "2 0.8", "3 0.4", "4 0.3", "5 0.2", "6 0.1"]
 
 
-def as_ecsv(path):
-    QTable({"w": WAVELENGTH, "f": FLUX}).write(path)
-
-
 def as_votable(path):
     gigahertz = 299792.458 / WAVELENGTH[::-1]
     QTable({"sed_freq": gigahertz, "sed_flux": FLUX[::-1]}).write(path, format="votable")
@@ -124,7 +120,7 @@ def as_votable(path):
     [
         ("star.txt", lambda path: path.write_text("\n".join(["# um Jy", *ROWS]))),
         ("star.txt", lambda path: path.write_bytes("\r\n".join(ROWS).encode())),
-        ("star.ecsv", as_ecsv),
+        ("star.ecsv", lambda path: QTable({"w": WAVELENGTH, "f": FLUX}).write(path)),
         ("star.vot", as_votable),
     ],
     ids=["text", "no comment", "ecsv", "votable"],

@@ -68,7 +68,7 @@ __all__ = [
 # documented.
 _FIT = 29.0
 _PLACE = 0.6
-_QUICK = 0.5
+_QUICK = 0.3
 _SEARCH = 8.0
 _DISK = 1.4
 _TIED = 0.6
