@@ -21,9 +21,8 @@ def calints(path, data, error=None, quality=None, *, leave_out=(), primary=None,
     for name, array in (("SCI", data), ("ERR", error), ("DQ", quality)):
         if name not in leave_out:
             hdus.append(fits.ImageHDU(array, name=name))
-    for hdu, cards in zip(
-        hdus, ({**PRIMARY, **(primary or {})}, {**SCIENCE, **science}), strict=False
-    ):
+    headers = ({**PRIMARY, **(primary or {})}, {**SCIENCE, **science})
+    for hdu, cards in zip(hdus, headers, strict=False):
         hdu.header.update({key: value for key, value in cards.items() if value is not None})
     fits.HDUList(hdus).writeto(path)
     return path

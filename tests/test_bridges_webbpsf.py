@@ -13,15 +13,8 @@ from derivatives import slopes
 
 from benchmarks import stpsf_data
 from benchmarks.stpsf_data import lopsided, pupil, zernike_tensor
+from pyklip_diffrender import errors
 from pyklip_diffrender.bridges import from_webbpsf, opd_to_webbpsf
-from pyklip_diffrender.errors import (
-    CorruptFileError,
-    DiffrenderWarning,
-    IncompatibleSetupError,
-    NonFiniteError,
-    ShapeError,
-    UnitError,
-)
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.optics import JWST_DIAMETER, OpticalSystem, PupilGrid
 from pyklip_diffrender.optics.grid import zernike_basis
@@ -101,7 +94,7 @@ def test_a_script_for_stpsf_runs_unchanged(nircam, tmp_path):
     psf, waves = model.calc_psf(**arcsec, detector_oversample=1, return_intermediates=True)
     assert len(waves) == 6
     assert waves[-1].shape == psf[0].data.shape
-    with pytest.raises(IncompatibleSetupError, match="not all three"):
+    with pytest.raises(errors.IncompatibleSetupError, match="not all three"):
         model.calc_psf(oversample=2, fft_oversample=2, detector_oversample=2)
 
 
@@ -132,7 +125,7 @@ def test_a_refined_wavefront_goes_back(nircam):
     again = from_webbpsf(instrument, **FAST)
     assert np.abs(again.entrance.opd.numpy() - opd).max() < 1e-20
     # Upside down, or without taking out the field dependence, it would not be the same image.
-    with pytest.warns(DiffrenderWarning, match="upside down"):
+    with pytest.warns(errors.DiffrenderWarning, match="upside down"):
         instrument.pupilopd = opd_to_webbpsf(opd[::-1].copy(), instrument)
     assert error(model(opd), instrument.calc_psf(**FAST)["DET_DIST"].data) > 1e-2
     instrument.pupilopd[0].data = opd
@@ -226,19 +219,19 @@ def test_the_embedded_coronagraph_has_the_orientation_of_stpsf(nircam):
 
 
 def test_what_cannot_be_converted(nircam):
-    with pytest.raises(IncompatibleSetupError, match=r"expected an stpsf\.NIRCam"):
+    with pytest.raises(errors.IncompatibleSetupError, match=r"expected an stpsf\.NIRCam"):
         from_webbpsf("NIRCam")
-    with pytest.raises(IncompatibleSetupError, match="'linear' is not supported"):
+    with pytest.raises(errors.IncompatibleSetupError, match="'linear' is not supported"):
         from_webbpsf(nircam(jitter="linear"), **FAST)
-    with pytest.raises(IncompatibleSetupError, match="too short for NIRCam long wave"):
+    with pytest.raises(errors.IncompatibleSetupError, match="too short for NIRCam long wave"):
         from_webbpsf(nircam(), monochromatic=2e-6)
-    with pytest.warns(DiffrenderWarning, match=r"3\.5e-06 m is outside F444W"):
+    with pytest.warns(errors.DiffrenderWarning, match=r"3\.5e-06 m is outside F444W"):
         from_webbpsf(nircam(), **{**FAST, "monochromatic": 3.5 * u.um})
 
 
 @pytest.mark.parametrize(
     ("factor", "expected", "complaint"),
-    [(1e6, UnitError, "in microns"), (np.nan, NonFiniteError, "NaN")],
+    [(1e6, errors.UnitError, "in microns"), (np.nan, errors.NonFiniteError, "NaN")],
 )
 def test_maps_that_cannot_be_right(nircam, factor, expected, complaint):
     instrument = nircam()
@@ -256,7 +249,7 @@ def test_a_map_of_another_size_is_resampled(nircam):
     maps = (np.kron(opd, np.ones((2, 2))), opd)
     taken, wanted = (opd_to_webbpsf(each, nircam())[0].data for each in maps)
     assert np.abs(taken - wanted).max() < 1e-20
-    with pytest.raises(ShapeError, match=r"got shape \(100, 90\)"):
+    with pytest.raises(errors.ShapeError, match=r"got shape \(100, 90\)"):
         opd_to_webbpsf(np.zeros((100, 90)), nircam())
 
 
@@ -267,7 +260,7 @@ def test_a_missing_file_is_named_with_the_directory(nircam, stpsf_path, missing)
     instrument, path = nircam(), stpsf_path / missing
     aside = path.rename(path.with_suffix(".aside"))
     try:
-        with pytest.raises(CorruptFileError, match=f"{path.name}.*STPSF_PATH is"):
+        with pytest.raises(errors.CorruptFileError, match=f"{path.name}.*STPSF_PATH is"):
             from_webbpsf(instrument, add_distortion=True, **FAST)
     finally:
         aside.rename(path)

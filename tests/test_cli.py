@@ -23,14 +23,9 @@ from astropy.io import fits
 from small_files import calints
 from synthetic_searches import searched, write_searched
 
+from pyklip_diffrender import errors
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.cli.session import Run
-from pyklip_diffrender.errors import (
-    DiffrenderWarning,
-    IncompatibleSetupError,
-    MissingOPDError,
-    RefinementError,
-)
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.reduction import UNFINISHED, Preparation, ProductFolder, ReduceOptions
@@ -209,9 +204,9 @@ def test_links_that_lead_nowhere_are_refused_before_the_fit(tmp_path, place, ove
         output.mkdir()
     for path, target in links[place].items():
         path.symlink_to(target)
-    with pytest.raises(IncompatibleSetupError, match=r"--output: .* is a link to .*, which does"):
+    with pytest.raises(errors.IncompatibleSetupError, match=r"--output: .* is a link to .*, which"):
         Run().claim_folder(output, ("report.html",), overwrite)
-    with pytest.raises(IncompatibleSetupError, match=r"OUTPUT: .* is a link to "):
+    with pytest.raises(errors.IncompatibleSetupError, match=r"OUTPUT: .* is a link to "):
         Run().claim_file(product if place == "product" else output, overwrite)
 
 
@@ -465,9 +460,9 @@ def reduced(monkeypatch):
 
     def stub(given, *, progress, products):
         print("a library says hello")
-        if isinstance(made.error, RefinementError):
+        if isinstance(made.error, errors.RefinementError):
             for _ in range(2):
-                warnings.warn("the map is old", DiffrenderWarning, stacklevel=1)
+                warnings.warn("the map is old", errors.DiffrenderWarning, stacklevel=1)
         if made.error is not None:
             raise made.error
         made.append(StubReduction(given, progress, made.interrupted_writing, made.writes))
@@ -556,7 +551,7 @@ def test_general_options_stand_before_or_after_the_command(
 def test_warnings_and_errors_are_messages(tmp_path, detecting, reduced, capsys):
     (tmp_path / "old").mkdir()
     opd_file(tmp_path / "old" / "opd_2020-01-01.fits")
-    reduced.error = RefinementError("no fit")
+    reduced.error = errors.RefinementError("no fit")
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         assert main([*detecting, "--opd", str(tmp_path / "old"), "-q"]) == 1
@@ -600,7 +595,7 @@ def test_mast_is_asked_for_the_map_of_the_date(detecting, reduced, capsys, monke
     def retrieve(date, choice):
         asked.append((date.isot[:19], choice))
         if choice == "after":
-            raise MissingOPDError("no wavefront map from MAST (no route to host)")
+            raise errors.MissingOPDError("no wavefront map from MAST (no route to host)")
         return random_opd(1, npix=64)
 
     monkeypatch.setattr("pyklip_diffrender.cli.reducing.load_wss_opd_by_date", retrieve)

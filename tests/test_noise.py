@@ -37,8 +37,7 @@ def test_the_constant_part_of_the_errors_is_measured_whatever_the_outliers(noise
 def test_frames_without_far_pixels_keep_their_errors():
     data, error, _ = frames(0.3, 0.5)
     near = (slice(None), slice(110, 190), slice(110, 190))
-    found, ratios = calibrated_errors(
-        data[near], error[near], np.ones((1, 80, 80), bool), CENTER - 110, SCALE
-    )
+    valid = np.ones((1, 80, 80), bool)
+    found, ratios = calibrated_errors(data[near], error[near], valid, CENTER - 110, SCALE)
     np.testing.assert_array_equal(found, error[near])
     assert np.isnan(ratios).all()

@@ -1,12 +1,13 @@
-"""Models in forked processes."""
+"""Models in forked processes, and memory that a process keeps."""
 
 import os
+import platform
 import subprocess
 import sys
 
 import pytest
 
-SCRIPT = """
+FORK = """
 import multiprocessing, torch
 import pyklip_diffrender as dr
 
@@ -26,12 +27,33 @@ assert abs(there / here - 1) < 1e-12, (here, there)
 assert threads == 1 and torch.get_num_threads() == 2
 """
 
+MEMORY = """
+import numpy
+from pyklip_diffrender.cli.session import keep_freed_memory
+
+def pages():
+    return int(open("/proc/self/statm").read().split()[1])
+
+keep_freed_memory()
+arrays = [numpy.ones(2_500_000) for _ in range(20)]
+full = pages()
+del arrays
+assert pages() > 0.9 * full, (pages(), full)
+"""
+
+
+def run(script):
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+
 
 @pytest.mark.skipif(not hasattr(os, "register_at_fork"), reason="this system has no fork")
 def test_a_forked_child_computes_after_a_parent_with_two_threads():
     """Threads of the parent do not exist in the child, which would wait for them forever."""
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", SCRIPT], capture_output=True,
-        text=True, check=False, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    run(FORK)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators stay as they are")
+def test_the_command_line_uses_freed_memory_again():
+    run(MEMORY)

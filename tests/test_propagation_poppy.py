@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks import poppy_reference as reference
-from pyklip_diffrender.instrument import (
-    NIRCAM_LW_PIXELSCALE,
-    jwst_pupil,
-    maskrnd_openings,
-    nircam_coronagraph,
-)
+from pyklip_diffrender import instrument
 from pyklip_diffrender.optics import PupilGrid, polygon_coverage
 
 NPIX = 128
@@ -24,7 +19,7 @@ def star(separation):
 
 
 def ours(occulter_sampling=None, route="auto"):
-    return nircam_coronagraph(
+    return instrument.nircam_coronagraph(
         monochromatic=WAVELENGTH,
         npix=NPIX,
         occulter_sampling=occulter_sampling,
@@ -36,10 +31,10 @@ def ours(occulter_sampling=None, route="auto"):
 
 def system(oversample):
     return reference.coronagraph(
-        jwst_pupil(NPIX).numpy(), reference.lopsided_opd(NPIX),
-        polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy(),
+        instrument.jwst_pupil(NPIX).numpy(), reference.lopsided_opd(NPIX),
+        polygon_coverage(instrument.maskrnd_openings(), PupilGrid.full(NPIX)).numpy(),
         reference.zernike_opd(reference.lopsided_zernikes(), NPIX), oversample=oversample,
-        fov_pixels=80, pixelscale=NIRCAM_LW_PIXELSCALE,
+        fov_pixels=80, pixelscale=instrument.NIRCAM_LW_PIXELSCALE,
     )  # fmt: skip
 
 

@@ -27,6 +27,7 @@ from pyklip_diffrender.cli.session import (
     declared,
     file_type,
     free_memory,
+    keep_freed_memory,
     open_streams,
     option,
     outputs,
@@ -680,6 +681,7 @@ def main(arguments: abc.Sequence[str] | None = None) -> int:
     # Threads of PyTorch that wait in a loop take the processor from other processes. Libraries read
     # this when they are loaded, which is later.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    keep_freed_memory()
     run = Run()
     with open_streams(), run.messages():
         try:
