@@ -172,7 +172,7 @@ def claims():
     snr = stated("S/N of the companion")
     visits = [{"visit": k} for k in (0, 1)]
     scatter = np.prod([table("visits_null")[name] for name in ("scatter", "factor")], axis=0)
-    ours, pages = "klip_over_ours_raw", of_pairs(IMAGES, "ratio")
+    ours, pages, pulls = "klip_over_ours_raw", of_pairs(IMAGES, "ratio"), table("visit_planets")
     return (
         (README, "has S/N {:.1f} and a contrast of {:.2f}e-6 +- {:.2f}e-6.",
          [stated("demo: S/N"), *demo]),
@@ -271,6 +271,10 @@ def claims():
               ("Limits are {:.2f} to {:.2f} times those without the field", 0.0, "limits"))),
         (REFERENCES, "mean (least, greatest) | {:.3f} ({:.2f}, {:.2f}) |",
          [f(scatter) for f in (np.mean, min, max)]),
+        *((REFERENCES, f"| {name} | {{:.2f}} | {{:+.2f}} |",
+           [np.mean(pull**2) ** 0.5, np.mean(pull)])
+          for name, pull in (("separation", pulls["separation_pull"]),
+                             ("position angle", pulls["angle_pull"]))),
         *((CALIBRATION, f"| {hours} | {{:.3f}} | {{:.3f}} | {{:.3f}} |", calibration(hours))
           for hours in (0, 3, 40, 86, 200)),
         *((CALIBRATION, f"| {name} | {{:{form}f}} +- {{:{form}f}} | {{:+.2f}} +- {{:.2f}} "

@@ -96,6 +96,8 @@ class _Schedule:
             # noted.
             rest = (self._own * (1 - self._part) + later) * pace - (spent - self._part_spent)
             return f", about {duration(max(rest, later * pace))} left"
+        if not self._own:
+            return f", about {duration(later * pace)} left"
         if spent <= self._own * pace:
             return f", about {duration((self._own + later) * pace - spent)} left"
         if not later:
