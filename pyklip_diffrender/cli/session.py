@@ -59,7 +59,7 @@ def keep_freed_memory() -> None:
     """Let glibc use the memory of freed arrays again, up to 32 MB each, for later ones.
 
     By default it goes back to the system, which has to clear it for the next array: that is 6 % of
-    the time of a reduction. Larger arrays do go back, so that a reduction does not take more.
+    the time of one roll. Larger arrays do go back, so that a reduction does not take more memory.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
