@@ -60,7 +60,10 @@ def keep_freed_memory() -> None:
 
     By default it goes back to the system, which has to clear it for the next array: that is 6 % of
     the time of one roll. Larger arrays do go back, so that a reduction does not take more memory.
+    Whoever has set a variable of glibc's allocator has chosen.
     """
+    if any(name.startswith("MALLOC_") for name in os.environ):
+        return
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         mallopt(_MMAP_THRESHOLD, _KEPT)

@@ -87,10 +87,10 @@ _QUICK: dict[str, Any] = {
     "relinearise": 0.3,
 }
 """Other settings of a first look, whose time and limits `benchmarks.first_look` compares with those
-of full fits. With a tolerance of 1e-3, it takes 1.2 times as long, and limits are no nearer to
-those; with 0.03, the fit of two rolls of HIP 17695 in F356W ends before it explains the frames.
-Without accurate steps, limits are 1.3 times as large. With three wavelengths in the model, the fit
-does not explain the frames."""
+of full fits. With a tolerance of 1e-3, it takes 1.2 to 1.4 times as long, and median limits change
+by up to 4 %; with 0.03, the fit of two rolls of HIP 17695 in F356W ends before it explains the
+frames. Without accurate steps, limits are 1.3 times as large. With three wavelengths in the model,
+the fit does not explain the frames."""
 
 _PROCESS = 1.3e9
 """Memory that the package and PyTorch take, with what a fit needs for a while, bytes."""
