@@ -14,14 +14,8 @@ from pyklip import rdi
 from pyklip.instruments.Instrument import Data
 from pyklip.instruments.utils import wcsgen
 
+from pyklip_diffrender import pyklip_backend
 from pyklip_diffrender.errors import DiffrenderWarning
-from pyklip_diffrender.pyklip_backend import (
-    DiffrenderSettings,
-    backend,
-    is_registered,
-    register,
-    unregister,
-)
 from pyklip_diffrender.pyklip_backend.patch import spawned_beside_klip
 
 # pyKLIP 2.10 takes the mean of sections that are all NaN.
@@ -71,8 +65,8 @@ def test_a_pipelines_own_dataset(mode, rng, tmp_path):
     images = frames(ANGLES, rng)
     star = 900 * psf(*CENTER) + rng.normal(0, 0.05, (4, *SHAPE))
     dataset = PipelineData(images, star)
-    dataset.diffrender = DiffrenderSettings(opd=OPD, subtractor=render)
-    with backend():
+    dataset.diffrender = pyklip_backend.DiffrenderSettings(opd=OPD, subtractor=render)
+    with pyklip_backend.backend():
         # The algorithm is not the pipeline's to choose: it calls pyKLIP without `algo`.
         files = reduced(
             dataset, tmp_path, "", algo="klip", mode=mode, numbasis=[1, 4], movement=1,
@@ -105,7 +99,7 @@ def test_the_start_method_of_processes_changes_nothing(method, threads, rng, tmp
     before = multiprocessing.get_start_method(allow_none=True)
     for start, count in (("fork", 1), (method, threads)):
         multiprocessing.set_start_method(start, force=True)
-        with backend(opd=OPD, subtractor=render):
+        with pyklip_backend.backend(opd=OPD, subtractor=render):
             files = reduced(
                 generic(images, ANGLES), tmp_path, annuli=2, numbasis=[1], highpass=8.0,
                 time_collapse="weighted-mean", numthreads=count,
@@ -129,33 +123,33 @@ def call(rng, folder, algo):
 @pytest.mark.parametrize("algo", ["klip", "diffrender"])
 def test_a_block_of_another_thread_is_mentioned(algo, rng, tmp_path):
     # Warnings are errors here, so that KLIP does not run.
-    with backend(opd=OPD, subtractor=render):
+    with pyklip_backend.backend(opd=OPD, subtractor=render):
         raised = call(rng, tmp_path, algo)
     assert isinstance(raised, DiffrenderWarning)
     assert "in this thread" in str(raised)
 
 
 def test_what_is_registered_holds_in_threads(rng, tmp_path):
-    register(opd=OPD, subtractor=render, replace=True)
+    pyklip_backend.register(opd=OPD, subtractor=render, replace=True)
     raised = call(rng, tmp_path, "klip")
-    unregister()
+    pyklip_backend.unregister()
     assert raised is None
     assert "DRALGO" in fits.getheader(tmp_path / "x-KLmodes-all.fits")
 
 
 def test_who_takes_calls_of_klip_is_in_the_environment(monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
-    with backend(opd=OPD, force=False):
+    with pyklip_backend.backend(opd=OPD, force=False):
         assert VARIABLE not in os.environ
-        with backend(opd=OPD):
+        with pyklip_backend.backend(opd=OPD):
             assert os.environ[VARIABLE] == str(os.getpid())
             assert not spawned_beside_klip()
         assert VARIABLE not in os.environ
-    register(opd=OPD, replace=True)
+    pyklip_backend.register(opd=OPD, replace=True)
     assert VARIABLE in os.environ
-    unregister()
+    pyklip_backend.unregister()
     assert VARIABLE not in os.environ
-    assert not is_registered()
+    assert not pyklip_backend.is_registered()
 
 
 SCRIPT = """
@@ -166,7 +160,7 @@ import pyklip_diffrender as dr
 def work(_):
     from pyklip import parallelized
     from pyklip_diffrender.pyklip_backend import is_registered
-    assert not is_registered()
+    assert not pyklip_backend.is_registered()
     warnings.simplefilter("error")
     try:
         parallelized.klip_dataset(None, algo="klip")

@@ -12,13 +12,8 @@ from pyklip import fakes
 from pyklip.instruments.JWST import JWSTData
 from pyklip.klip import high_pass_filter
 
+from pyklip_diffrender import pyklip_backend
 from pyklip_diffrender.errors import DiffrenderWarning
-from pyklip_diffrender.pyklip_backend import (
-    DiffrenderSettings,
-    backend,
-    observation_from_dataset,
-    unregister,
-)
 
 NATIVE = (20.7, 25.2)
 MIDDLE = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
@@ -48,10 +43,10 @@ def reduce(dataset, folder, **kw):
 
 
 def test_reading_is_the_same_and_the_reader_is_put_back(files, reference):
-    unregister()
+    pyklip_backend.unregister()
     plain = JWSTData(files, reference)
     readdata = vars(JWSTData)["readdata"]
-    with backend(opd=OPD):
+    with pyklip_backend.backend(opd=OPD):
         captured = JWSTData(files, reference)
         assert vars(JWSTData)["readdata"] is not readdata
         assert JWSTData.readdata.__doc__ == readdata.__doc__
@@ -65,7 +60,7 @@ def test_reading_is_the_same_and_the_reader_is_put_back(files, reference):
 
 def test_the_fit_gets_recorded_pixels_errors_flags_and_headers(files, rng):
     dataset = JWSTData(files)
-    observation = observation_from_dataset(copy.deepcopy(dataset))
+    observation = pyklip_backend.observation_from_dataset(copy.deepcopy(dataset))
     recorded = np.concatenate([fits.getdata(path, "SCI") for path in files])
     good = observation.valid
     np.testing.assert_array_equal(observation.data[good], recorded[good])
@@ -92,7 +87,7 @@ def test_filters_are_fitted_one_by_one(tmp_path, rng, monkeypatch):
         seen.append((observation.filter, list(observation.position_angles), names))
         return render(observation, opd, settings)
 
-    unregister()
+    pyklip_backend.unregister()
     in_place_of_fits(monkeypatch, subtract)
     paths, others = [], []
     for name in ("F356W", "F444W"):
@@ -101,7 +96,7 @@ def test_filters_are_fitted_one_by_one(tmp_path, rng, monkeypatch):
     for roll, name in ((0.0, "F356W"), (0.0, "F444W"), (10.0, "F356W"), (10.0, "F444W")):
         paths.append(str(tmp_path / f"{name}_{roll:.0f}.fits"))
         calints(paths[-1], rng, roll, NATIVE, nints=1, FILTER=name, TARGPROP="STAR")
-    with backend(opd=OPD):
+    with pyklip_backend.backend(opd=OPD):
         dataset = JWSTData(paths, others)
         reduce(dataset, tmp_path / "out", mode="ADI+RDI+SDI", psf_library=dataset.psflib)
     assert seen == [
@@ -127,7 +122,7 @@ def test_center_keywords_and_dithers(tmp_path, rng):
         ({"center_include_offset": False}, (21.0, 23.0)),
         ({"center_keywords": ["CRPIX1", "CRPIX2"]}, (21.7, 25.2)),
     ):
-        observation = observation_from_dataset(JWSTData([str(path)], **kw))
+        observation = pyklip_backend.observation_from_dataset(JWSTData([str(path)], **kw))
         np.testing.assert_allclose(observation.center[0], expected)
 
 
@@ -156,7 +151,7 @@ def test_products_are_aligned_as_pyklip_aligns_and_keep_its_header(files, refere
 def test_companions_injected_after_reading_are_in_what_is_fitted_and_kept(files, tmp_path):
     dataset = JWSTData(files)
     copied = copy.deepcopy(dataset)
-    dataset.diffrender = DiffrenderSettings(fit_pixels=24)
+    dataset.diffrender = pyklip_backend.DiffrenderSettings(fit_pixels=24)
     fakes.inject_planet(copied.input, copied.centers, 3.0, copied.wcs, 13.0, 0.0, fwhm=4.0)
     clean, _ = reduce(dataset, tmp_path / "clean", aligned_center=MIDDLE)
     image, header = reduce(copied, tmp_path / "injected", aligned_center=MIDDLE)
@@ -176,7 +171,7 @@ def test_companions_injected_after_reading_are_in_what_is_fitted_and_kept(files,
 def test_a_pixel_masked_by_hand_is_not_fitted(files, tmp_path):
     dataset = JWSTData(files)
     dataset.input[0, 14, 12] = np.nan
-    observation = observation_from_dataset(dataset)
+    observation = pyklip_backend.observation_from_dataset(dataset)
     lost = np.argwhere(~observation.valid[0] & observation.valid[1])
     assert 1 <= len(lost) <= 9
     shift = np.array(NATIVE[::-1]) - MIDDLE[::-1]
@@ -201,10 +196,10 @@ def test_a_changed_dataset_is_taken_as_it_is(files, tmp_path):
 
 
 def test_a_dataset_read_before_registering_still_works(files, tmp_path):
-    unregister()
+    pyklip_backend.unregister()
     dataset = JWSTData(files)
     with (
-        backend(opd=OPD, subtractor=render),
+        pyklip_backend.backend(opd=OPD, subtractor=render),
         pytest.warns(DiffrenderWarning, match=r"made before register\(\).*files="),
     ):
         _, header = reduce(dataset, tmp_path / "out", algo="klip")
@@ -212,7 +207,7 @@ def test_a_dataset_read_before_registering_still_works(files, tmp_path):
     # The wavelength is one of the table that pyKLIP looked it up in.
     assert header["DRFILT"] == "F444W"
     # The files are found in a folder, and are read as if the backend had been there.
-    with backend(opd=OPD, subtractor=render, files=tmp_path):
+    with pyklip_backend.backend(opd=OPD, subtractor=render, files=tmp_path):
         late, header = reduce(JWSTData(files), tmp_path / "out", algo="klip")
         early, _ = reduce(JWSTData(files), tmp_path / "out", algo="klip")
     assert (header["DRPIXELS"], header["DRNOISE"]) == ("recorded", "ERR")
@@ -223,11 +218,11 @@ def test_a_dataset_read_before_registering_still_works(files, tmp_path):
 def test_frames_that_were_multiplied_after_reading(files, tmp_path):
     """The fit has the unit of the files, and the products that of the dataset."""
     expected, _ = reduce(JWSTData(files), tmp_path / "out")
-    fitted = observation_from_dataset(JWSTData(files))
+    fitted = pyklip_backend.observation_from_dataset(JWSTData(files))
     for factors in (1e3, np.array([2.0, 3.0, 2.5, 3.5])[:, None, None]):
         dataset = JWSTData(files)
         dataset.input *= factors
-        again = observation_from_dataset(dataset)
+        again = pyklip_backend.observation_from_dataset(dataset)
         # The factor is known to the rounding of single precision.
         np.testing.assert_allclose(again.data, fitted.data, rtol=1e-5)
         np.testing.assert_array_equal(again.error, fitted.error)
@@ -239,24 +234,24 @@ def test_frames_that_were_multiplied_after_reading(files, tmp_path):
 
 def test_frames_that_were_left_out_moved_or_filtered_after_reading(files):
     dataset = JWSTData(files)
-    whole = observation_from_dataset(dataset)
+    whole = pyklip_backend.observation_from_dataset(dataset)
     kept = [2, 0]
     for name in ("input", "centers", "filenames", "PAs", "wvs", "wcs", "filenums"):
         setattr(dataset, name, np.asarray(getattr(dataset, name))[kept])
     dataset.centers = dataset.centers + 0.25
-    part = observation_from_dataset(dataset)
+    part = pyklip_backend.observation_from_dataset(dataset)
     np.testing.assert_array_equal(part.data, whole.data[kept])
     np.testing.assert_array_equal(part.error, whole.error[kept])
     # Whoever moves the star's position knows better where it is.
     np.testing.assert_allclose(part.center, whole.center[kept] + 0.25)
     dataset.filenames = np.array(["other_INT1", "other_INT2"])
     with pytest.warns(DiffrenderWarning, match="not those that were read, by their names"):
-        observation_from_dataset(dataset)
+        pyklip_backend.observation_from_dataset(dataset)
     # Filtered frames are not taken for recorded ones.
     dataset = JWSTData(files)
     dataset.input = np.array([high_pass_filter(each, 10) for each in dataset.input])
     with pytest.warns(DiffrenderWarning, match="changed by more than their noise"):
-        observation_from_dataset(dataset)
+        pyklip_backend.observation_from_dataset(dataset)
 
 
 def test_names_that_headers_cannot_hold(files, tmp_path):
@@ -268,7 +263,7 @@ def test_names_that_headers_cannot_hold(files, tmp_path):
     wavefront = tmp_path / "карта.fits"
     fits.PrimaryHDU(OPD.data, fits.Header({"BUNIT": "m"})).writeto(wavefront)
     dataset = JWSTData(named)
-    dataset.diffrender = DiffrenderSettings(opd=wavefront)
+    dataset.diffrender = pyklip_backend.DiffrenderSettings(opd=wavefront)
     _, header = reduce(dataset, tmp_path / "out")
     assert header["FILE_0"] == "? Pic gro?e 0_calints.fits_INT1.fits"
     assert header["DROPD"] == "?????.fits"
@@ -293,7 +288,7 @@ def test_files_without_errors_or_flags(tmp_path, rng):
         science, primary = hdus["SCI"].copy(), hdus[0].copy()
     science.data = science.data[0]
     fits.HDUList([primary, science]).writeto(path, overwrite=True)
-    observation = observation_from_dataset(JWSTData(str(path)))
+    observation = pyklip_backend.observation_from_dataset(JWSTData(str(path)))
     assert observation.valid.all()
     assert (observation.error > 0).all()
     np.testing.assert_array_equal(observation.data[0], science.data)

@@ -7,11 +7,7 @@ import pytest
 from scipy import stats
 from scipy.ndimage import gaussian_filter
 
-from pyklip_diffrender.detection.error_factor import (
-    ErrorFactor,
-    Significance,
-    structures_in_single_roll,
-)
+from pyklip_diffrender.detection import error_factor
 
 PIXEL = 0.06
 RESOLUTION = 0.15
@@ -42,7 +38,7 @@ def significance(**changes):
     offsets = np.arange(-5, 6.0)
     correlation = np.exp(-np.add.outer(offsets**2, offsets**2) / (4 * SMOOTH**2))
     values = {"grid": GRID, "starlight": STARLIGHT, "correlation": correlation, "inner": 0.2}
-    return Significance(**{**values, "resolution": RESOLUTION, **changes})
+    return error_factor.Significance(**{**values, "resolution": RESOLUTION, **changes})
 
 
 RINGS = (0.3, 0.5, 1.0, 2.0)
@@ -141,7 +137,7 @@ def test_probability_of_a_maximum_of_noise():
 
 
 def test_factors_are_interpolated_and_never_below_their_floor():
-    factor = ErrorFactor(DISTANCE + 0.5, np.full((80, 80), 50.0), GRID)
+    factor = error_factor.ErrorFactor(DISTANCE + 0.5, np.full((80, 80), 50.0), GRID)
     offsets = np.array([[0.3, 0.4], [0.0, -1.0]])
     np.testing.assert_allclose(factor.of(offsets), [1.0, 1.5], atol=0.01)
     np.testing.assert_allclose(factor.at([0.5, 1.0]), [1.0, 1.5], atol=0.01)
@@ -150,12 +146,12 @@ def test_factors_are_interpolated_and_never_below_their_floor():
     assert factor.of(np.array([[9.0, 0.0]])) == pytest.approx(factor.factors[40, -1], rel=0.01)
     assert factor.at(9.0) == pytest.approx(factor.factors[0, 0], rel=0.01)
     assert factor.is_needed
-    assert not ErrorFactor.constant(1.0).is_needed
+    assert not error_factor.ErrorFactor.constant(1.0).is_needed
 
 
 def test_noise_exceeds_the_threshold_as_rarely_as_gaussian_noise():
     freedom = np.where(DISTANCE < 1.0, 10.0, 50.0)
-    measured = ErrorFactor(np.ones((80, 80)), freedom, GRID)
+    measured = error_factor.ErrorFactor(np.ones((80, 80)), freedom, GRID)
     offsets = np.array([[0.4, 0.0], [2.0, 0.0]])
     threshold = measured.threshold(3.0, offsets)
     assert threshold[0] > threshold[1] > 3.0
@@ -167,12 +163,34 @@ def test_noise_exceeds_the_threshold_as_rarely_as_gaussian_noise():
     scatter = np.sqrt(rng.chisquare(10, count) / 10)
     exceeded = np.mean(rng.normal(size=count) / scatter > threshold[0])
     assert exceeded == pytest.approx(stats.norm.sf(3.0), rel=0.15)
-    known = ErrorFactor.constant(1.5)
+    known = error_factor.ErrorFactor.constant(1.5)
     np.testing.assert_allclose(known.threshold(3.0, offsets), 3.0)
 
 
 def test_structures_of_the_detector_are_as_frequent_as_in_real_single_rolls():
     # Of 12 real rolls, two have a candidate above 5.5; of their 20 signs, six a peak above 4.
-    assert 12 * structures_in_single_roll(5.5) == pytest.approx(1.2, abs=0.5)
-    assert 20 * structures_in_single_roll(4.0) == pytest.approx(6, abs=1.5)
-    assert 0 < structures_in_single_roll(30.0) < 1e-7
+    assert 12 * error_factor.structures_in_single_roll(5.5) == pytest.approx(1.2, abs=0.5)
+    assert 20 * error_factor.structures_in_single_roll(4.0) == pytest.approx(6, abs=1.5)
+    assert 0 < error_factor.structures_in_single_roll(30.0) < 1e-7
+
+
+def test_neighbours_that_agree_are_a_structure_and_not_a_flat_field():
+    flat = 0.04 * np.random.default_rng(4).normal(size=(80, 80))
+    away = np.hypot(GRID[..., 0] - 1.2, GRID[..., 1])
+    blob = 0.2 * np.exp(-4 * np.log(2) * (away / (2 * PIXEL)) ** 2)
+    for pattern in (flat, flat - blob):
+        np.testing.assert_array_equal(error_factor.compact_structures(pattern, 1.8), 0.0)
+    left = error_factor.compact_structures(flat + blob, 1.8)
+    np.testing.assert_array_equal(left, np.where(left != 0, flat + blob, 0.0))
+    assert 5 <= np.count_nonzero(left[away < 3 * PIXEL]) == np.count_nonzero(left) < 20
+
+
+def test_a_peak_on_a_structure_is_a_source_if_it_exceeds_what_the_structure_may_be():
+    structures = np.where((np.indices(DISTANCE.shape) == [[[60]], [[25]]]).all(axis=0), 4.0, 0.0)
+    judge = significance(structures=structures)
+    for there, elsewhere, expected in ((20, 0, None), (40, 0, (60, 25)), (20, 9, (20, 60))):
+        snr = noise(3)
+        snr[60, 25], snr[20, 60] = there, elsewhere
+        assert judge.next_peak(snr, NOTHING, 5.0, EVERYWHERE) == expected
+    factor, plain = (each.factor(noise(3), NOTHING).factors for each in (judge, significance()))
+    np.testing.assert_allclose(factor, np.hypot(plain, structures))

@@ -14,16 +14,8 @@ import torch
 from astropy import units as u
 from astropy.io import fits
 
+from pyklip_diffrender import io
 from pyklip_diffrender.errors import CorruptFileError, NonFiniteError
-from pyklip_diffrender.io import (
-    native_float64,
-    open_fits,
-    replacing,
-    require_finite,
-    sha256,
-    to_metres,
-    write_fits,
-)
 from pyklip_diffrender.io.headers import KEYWORDS, fits_unit, set_keyword
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,25 +46,25 @@ def test_every_kind_of_array_becomes_the_same_native_copy(dress, tmp_path):
     plain = np.arange(-24, 24, dtype=np.float64).reshape(6, 8) / 4
     plain.astype(">f8").tofile(tmp_path / "map.dat")
     value = dress(plain.copy(), tmp_path / "map.dat")
-    got = native_float64(value)
+    got = io.native_float64(value)
     np.testing.assert_array_equal(got, plain)
     assert got.dtype == np.dtype("=f8")
     assert got.dtype.isnative
     assert got.flags.c_contiguous
     assert not isinstance(got, np.memmap)
     torch.from_numpy(got)[:] = 7
-    to_metres(value, "x")[:] = 7
+    io.to_metres(value, "x")[:] = 7
     # What was given stays as it is.
-    np.testing.assert_array_equal(native_float64(value), plain)
+    np.testing.assert_array_equal(io.native_float64(value), plain)
 
 
 def test_values_that_are_not_finite_are_counted_and_located():
     array = np.zeros((5, 6))
     array[2, 3], array[4, 1], array[0, 5] = np.nan, np.inf, -np.inf
     with pytest.raises(NonFiniteError, match=r"map: 3 values.*\(0, 5\)"):
-        require_finite(array, "map")
+        io.require_finite(array, "map")
     with pytest.raises(NonFiniteError, match=r"map: 2 values.*\(2, 3\)"):
-        require_finite(array, "map", np.arange(30).reshape(5, 6) > 11)
+        io.require_finite(array, "map", np.arange(30).reshape(5, 6) > 11)
 
 
 @pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
@@ -80,7 +72,7 @@ def test_a_truncated_file_is_an_error_that_names_it(tmp_path, suffix):
     path = written(tmp_path / f"cut{suffix}")
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 99 // 100])
     complaint = pytest.raises(CorruptFileError, match=r"cut\.fits.*not a complete FITS file")
-    with complaint as caught, open_fits(path):
+    with complaint as caught, io.open_fits(path):
         pass
     assert isinstance(caught.value, OSError)
     assert str(path.stat().st_size) in str(caught.value)
@@ -92,16 +84,16 @@ def test_a_truncated_file_is_an_error_that_names_it(tmp_path, suffix):
 def test_what_is_not_fits_is_a_corrupt_file(tmp_path, content):
     path = tmp_path / "other.fits"
     path.write_bytes(content)
-    with pytest.raises(CorruptFileError, match=r"other\.fits"), open_fits(path):
+    with pytest.raises(CorruptFileError, match=r"other\.fits"), io.open_fits(path):
         pass
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path):
     for path in (tmp_path / "nowhere.fits", tmp_path):
-        with pytest.raises(CorruptFileError, match=path.name), open_fits(path):
+        with pytest.raises(CorruptFileError, match=path.name), io.open_fits(path):
             pass
         # As other libraries have it.
-        with pytest.raises(FileNotFoundError), open_fits(path):
+        with pytest.raises(FileNotFoundError), io.open_fits(path):
             pass
 
 
@@ -115,7 +107,7 @@ def test_an_unusual_but_complete_header_is_no_corruption(tmp_path):
     end = raw.index(b"END" + b" " * 77)
     raw[end : end + 160] = b"BLANK   =                -9999".ljust(80) + b"END".ljust(80)
     path.write_bytes(bytes(raw))
-    with pytest.warns(fits.verify.VerifyWarning, match="BLANK"), open_fits(path) as hdus:
+    with pytest.warns(fits.verify.VerifyWarning, match="BLANK"), io.open_fits(path) as hdus:
         assert hdus[0].data.sum() == 16.0
 
 
@@ -124,10 +116,10 @@ def test_a_written_file_reads_back_and_leaves_nothing_else(tmp_path, suffix):
     path = tmp_path / "new" / f"product{suffix}"
     data = np.arange(12.0).reshape(3, 4)
     for scale in (1, 2):
-        write_fits(fits.HDUList([fits.PrimaryHDU(scale * data)]), path)
+        io.write_fits(fits.HDUList([fits.PrimaryHDU(scale * data)]), path)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
     assert (path.read_bytes()[:2] == b"\x1f\x8b") == (suffix == ".fits.gz")
-    with open_fits(path) as hdus:
+    with io.open_fits(path) as hdus:
         kept = hdus[0].data
     np.testing.assert_array_equal(kept, 2 * data)
 
@@ -151,9 +143,9 @@ def test_a_new_product_has_the_permissions_of_any_new_file(tmp_path, umask, suff
         path = tmp_path / f"{mask:o}{suffix}"
         umask(mask)
         if suffix == ".fits":
-            write_fits(fits.HDUList([fits.PrimaryHDU()]), path)
+            io.write_fits(fits.HDUList([fits.PrimaryHDU()]), path)
         else:
-            with replacing(path) as temporary:
+            with io.replacing(path) as temporary:
                 temporary.write_text("new")
         assert permissions(path) == expected
 
@@ -163,7 +155,7 @@ def test_a_replaced_product_keeps_its_permissions(tmp_path, umask):
     umask(0o022)
     for mode in (0o660, 0o444, 0o600):
         path.chmod(mode)
-        write_fits(fits.HDUList([fits.PrimaryHDU()]), path)
+        io.write_fits(fits.HDUList([fits.PrimaryHDU()]), path)
         assert permissions(path) == mode
 
 
@@ -172,7 +164,7 @@ def test_two_threads_that_write_one_product_leave_one_of_the_two(tmp_path):
     path, both = tmp_path / "product.txt", threading.Barrier(2)
 
     def write(word):
-        with replacing(path) as temporary:
+        with io.replacing(path) as temporary:
             both.wait(10)
             temporary.write_text(1000 * word)
 
@@ -187,7 +179,7 @@ def test_a_failure_while_writing_leaves_the_old_file(tmp_path):
     path.write_text("old")
 
     def write_half():
-        with replacing(path) as temporary:
+        with io.replacing(path) as temporary:
             temporary.write_text("ne")
             raise RuntimeError("halfway")
 
@@ -200,7 +192,7 @@ def test_a_failure_while_writing_leaves_the_old_file(tmp_path):
 @pytest.mark.hard
 def test_a_process_killed_while_writing_leaves_the_old_product_intact(tmp_path, killed):
     path = written(tmp_path / "product.fits")
-    before = sha256(path)
+    before = io.sha256(path)
     killed(
         """
         import sys, time
@@ -212,7 +204,7 @@ def test_a_process_killed_while_writing_leaves_the_old_product_intact(tmp_path, 
         """,
         path,
     )
-    assert sha256(path) == before
+    assert io.sha256(path) == before
 
 
 def test_every_keyword_that_is_written_is_declared():

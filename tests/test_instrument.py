@@ -10,18 +10,8 @@ import torch
 from astropy.io import fits
 from astropy.table import Table
 
+from pyklip_diffrender import instrument
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument import (
-    FILTERS,
-    MASKS,
-    ChromaticAberration,
-    detector_place,
-    filter_shift,
-    filter_throughput,
-    internal_wavefront_error,
-    is_short_wave,
-    nircam_coronagraph,
-)
 from pyklip_diffrender.wavefront import random_opd
 
 SMALL = {"npix": 128, "fov_pixels": 24}
@@ -38,15 +28,15 @@ def opd():
 )
 def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(mask, filter_name, opd):
     """Where half of a planet's light passes the mask, and beyond it, where all does."""
-    model = nircam_coronagraph(filter_name, image_mask=mask, nlambda=2, **SMALL)
-    clear = nircam_coronagraph(filter_name, image_mask=None, nlambda=2, **SMALL)
+    model = instrument.nircam_coronagraph(filter_name, image_mask=mask, nlambda=2, **SMALL)
+    clear = instrument.nircam_coronagraph(filter_name, image_mask=None, nlambda=2, **SMALL)
     assert model.planes[0].name == mask
-    scale = detector_place(mask, filter_name).pixelscale
+    scale = instrument.detector_place(mask, filter_name).pixelscale
     assert model.detector.pixelscale == (scale, scale)
     unocculted = float(clear(opd).sum())
     assert float(model(opd).sum()) < 0.03 * unocculted
-    half = float(model(opd, (1.3 / MASKS[mask].sigma * 1.616, 0.0)).sum())
-    outside = (1.02 * MASKS[mask].radius, 0.0)
+    half = float(model(opd, (1.3 / instrument.MASKS[mask].sigma * 1.616, 0.0)).sum())
+    outside = (1.02 * instrument.MASKS[mask].radius, 0.0)
     beyond = float(model(opd, outside).sum() / clear(opd, outside).sum())
     assert half < 0.8 * unocculted
     assert beyond == pytest.approx(1.0, abs=0.02)
@@ -54,11 +44,14 @@ def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(mask, filter_nam
 
 def test_another_mask_brings_its_own_aberrations():
     masks = ("MASK210R", "MASK335R", "MASK430R")
-    tables = {mask: internal_wavefront_error(mask, short_wave=mask == "MASK210R") for mask in masks}
+    tables = {
+        mask: instrument.internal_wavefront_error(mask, short_wave=mask == "MASK210R")
+        for mask in masks
+    }
     rms = {mask: float(table[3:].norm() * 1e9) for mask, table in tables.items()}
     # The official table's column WFE_RMS, nm: of the lit part of the pupil, not of the circle.
     assert rms == pytest.approx({"MASK210R": 161, "MASK335R": 176, "MASK430R": 171}, rel=0.02)
-    flipped = internal_wavefront_error("MASK335R", flip=False)
+    flipped = instrument.internal_wavefront_error("MASK335R", flip=False)
     changed = (flipped != tables["MASK335R"]).nonzero().flatten() + 1
     # Noll's sines, which change sign with y: all odd ones that are not round.
     assert changed.tolist() == [j for j in range(3, 36, 2) if j != 11]
@@ -66,12 +59,12 @@ def test_another_mask_brings_its_own_aberrations():
 
 def test_focus_is_zero_where_the_table_was_made_and_tilt_at_the_reference():
     """Elsewhere as by hand from stpsf's polynomials, nm: the focus of F444W is not negligible."""
-    long = ChromaticAberration(4.4e-6)
+    long = instrument.ChromaticAberration(4.4e-6)
     assert long(3.23e-6)[4] == 0
     assert long(4.4e-6)[3] == 0
     assert long(4.39e-6)[4] * 1e9 == pytest.approx(32.6, abs=0.05)
     assert (long(4.39e-6)[3] - long(3.35e-6)[3]) * 1e9 == pytest.approx(-233.4, abs=0.05)
-    short = ChromaticAberration(2.1e-6, short_wave=True)
+    short = instrument.ChromaticAberration(2.1e-6, short_wave=True)
     assert short(2.12e-6)[4] == 0
     assert short(2.0e-6)[4] * 1e9 == pytest.approx(-15.8, abs=0.05)
     assert short(2.0e-6)[3] * 1e9 == pytest.approx(-162.0, abs=0.05)
@@ -79,23 +72,23 @@ def test_focus_is_zero_where_the_table_was_made_and_tilt_at_the_reference():
 
 def test_places_on_the_detector_count_from_zero():
     """In the subarray of MASK335R, whose corner is at (491, 1501), it is (149.2, 173.6)."""
-    place = detector_place("MASK335R", "F444W")
+    place = instrument.detector_place("MASK335R", "F444W")
     assert place.detector == "NRCA5"
     assert np.subtract(place.center, (491, 1501)) == pytest.approx((149.2, 173.6))
-    assert filter_shift("F335M") == filter_shift("F210M") == (0.0, 0.0)
-    assert filter_shift("f444w") == (0.177, -0.205)
+    assert instrument.filter_shift("F335M") == instrument.filter_shift("F210M") == (0.0, 0.0)
+    assert instrument.filter_shift("f444w") == (0.177, -0.205)
 
 
 REFUSED = {
-    r"'MASKA335R'.*MASK335R": partial(detector_place, "MASKA335R", "F444W"),
-    r"'F150W'.*F182M.*F480M": partial(detector_place, "MASK335R", "F150W"),
-    "'b', expected 'A' or 'B'": partial(detector_place, "MASK335R", "F444W", module="b"),
-    r"F182M.*F480M, not for 'F277W'": partial(filter_shift, "F277W"),
+    r"'MASKA335R'.*MASK335R": partial(instrument.detector_place, "MASKA335R", "F444W"),
+    r"'F150W'.*F182M.*F480M": partial(instrument.detector_place, "MASK335R", "F150W"),
+    "'b', expected 'A' or 'B'": partial(instrument.detector_place, "MASK335R", "F444W", module="b"),
+    r"F182M.*F480M, not for 'F277W'": partial(instrument.filter_shift, "F277W"),
     r"NRCA5.*F210M.*NRCA2; use crosstalk=False": partial(
-        nircam_coronagraph, "F210M", image_mask="MASK210R", crosstalk=True
+        instrument.nircam_coronagraph, "F210M", image_mask="MASK210R", crosstalk=True
     ),
     r"NRCA5.*F444W.*NRCB5; use crosstalk=False": partial(
-        nircam_coronagraph, "F444W", module="B", crosstalk=True
+        instrument.nircam_coronagraph, "F444W", module="B", crosstalk=True
     ),
 }
 
@@ -106,15 +99,15 @@ def test_what_is_not_known_is_refused_with_what_is(complaint):
         REFUSED[complaint]()
 
 
-@pytest.mark.parametrize("mask", MASKS)
+@pytest.mark.parametrize("mask", instrument.MASKS)
 def test_module_b_has_every_mask_in_one_channel(mask):
     own, other = ("F210M", "F444W")[:: 1 if mask in ("MASK210R", "MASKSWB") else -1]
-    place = detector_place(mask, own, module="B")
+    place = instrument.detector_place(mask, own, module="B")
     assert (place.module, place.place, place.offset) == ("B", "-", 0.0)
     with pytest.raises(IncompatibleSetupError, match=rf"B does not have {mask} in {other}, only"):
-        nircam_coronagraph(other, image_mask=mask, module="B")
+        instrument.nircam_coronagraph(other, image_mask=mask, module="B")
     with pytest.raises(IncompatibleSetupError, match=rf"place along {mask} in module B: -$"):
-        nircam_coronagraph(own, image_mask=mask, module="B", bar_place="NARROW")
+        instrument.nircam_coronagraph(own, image_mask=mask, module="B", bar_place="NARROW")
 
 
 IPC = [[3.86e-4, 5.972e-3, 3.86e-4], [5.972e-3, 0.974569, 5.972e-3], [3.86e-4, 5.972e-3, 3.86e-4]]
@@ -133,7 +126,7 @@ def coupled(image):
 def test_crosstalk_couples_pixels_after_everything_else(values, oversample, opd):
     settings = {"nlambda": 1, "oversample": oversample, **SMALL}
     plain, model = (
-        nircam_coronagraph(**settings, crosstalk=each)(opd, **values).numpy()
+        instrument.nircam_coronagraph(**settings, crosstalk=each)(opd, **values).numpy()
         for each in (False, True)
     )
     truth = coupled(plain)
@@ -142,11 +135,11 @@ def test_crosstalk_couples_pixels_after_everything_else(values, oversample, opd)
     assert np.abs(plain - truth).max() > 5e-3 * truth.max()
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", instrument.FILTERS)
 def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official_files, name):
     data = fits.getdata(official_files / "NIRCam" / "filters" / f"{name}_throughput.fits")
     truth = data["THROUGHPUT"] / data["THROUGHPUT"].max()
-    wavelength, throughput = filter_throughput(name)
+    wavelength, throughput = instrument.filter_throughput(name)
     # The ends are where the table, in units of 0.1 Angstrom, has been rounded.
     where = data["WAVELENGTH"] * 1e-10
     inside = (where >= wavelength[0] - 1e-11) & (where <= wavelength[-1] + 1e-11)
@@ -159,26 +152,26 @@ def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official
 def test_aberrations_are_those_of_the_official_field_points(official_files, module):
     table = Table.read(official_files / "si_zernikes_coron_wfe.fits")
     places = [(r["instrument"].strip(), r["field_point_name"].strip()) for r in table]
-    for short_wave, mask in itertools.product((True, False), MASKS):
+    for short_wave, mask in itertools.product((True, False), instrument.MASKS):
         channel = f"NIRCam{'SW' if short_wave else 'LW'}{module}"
         row = table[places.index((channel, f"Z{mask[4:]}_{module}"))]
         truth = np.array([row[f"Zernike_{k}"] for k in range(1, 37)])
-        mine = internal_wavefront_error(mask, short_wave=short_wave, module=module)
+        mine = instrument.internal_wavefront_error(mask, short_wave=short_wave, module=module)
         np.testing.assert_allclose(mine, truth, rtol=1e-3, atol=1e-18)
 
 
 @pytest.mark.parametrize(
     ("mask", "filter_name", "module"),
     [
-        *itertools.product(MASKS, ("F210M", "F444W"), "A"),
+        *itertools.product(instrument.MASKS, ("F210M", "F444W"), "A"),
         *itertools.product(("MASK210R", "MASKSWB"), ["F210M"], "B"),
         *itertools.product(("MASK335R", "MASK430R", "MASKLWB"), ["F444W"], "B"),
     ],
 )
 def test_pixels_and_places_are_those_of_the_siaf(mask, filter_name, module):
     pysiaf = pytest.importorskip("pysiaf")
-    place = detector_place(mask, filter_name, module=module)
-    assert place.short_wave == is_short_wave(filter_name)
+    place = instrument.detector_place(mask, filter_name, module=module)
+    assert place.short_wave == instrument.is_short_wave(filter_name)
     along = "" if place.place == "-" else f"_{place.place}"
     siaf, full = pysiaf.Siaf("NIRCam"), "_FULL" if module == "A" else ""
     aperture = siaf[f"{place.detector}{full}_{mask}{along}"]

@@ -24,15 +24,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.reduction import existing_products, summarise, write_report
-from pyklip_diffrender.reduction.pages import (
-    Picture,
-    advice,
-    depth_against_klip,
-    plus_minus,
-    probability,
-    scientific,
-)
+from pyklip_diffrender.reduction import existing_products, pages, summarise, write_report
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.pipeline import looks_extended
 from pyklip_diffrender.reduction.products import page
@@ -134,11 +126,11 @@ def test_without_a_planet_the_sentence_states_the_limit():
     curve = bare.detection.contrast_curve
     # The field ends before 1 arcsec: the limit at 0.5 is the only one.
     limit = np.interp(0.5, curve["separation"].to_value(u.arcsec), curve["contrast"])
-    assert f"contrast {scientific(limit)} (" in said
+    assert f"contrast {pages.scientific(limit)} (" in said
     assert f"({-2.5 * np.log10(limit):.1f} mag fainter than the star) at 0.5 arcsec" in said
     # The limit is that of the threshold, the curve at 5 sigma whatever that is.
     strict = summarise(replace(bare, detection=replace(bare.detection, threshold=10.0)))
-    assert scientific(2 * usual["limits"][0]["contrast"]) in strict["sentence"]
+    assert pages.scientific(2 * usual["limits"][0]["contrast"]) in strict["sentence"]
     assert strict["limits"] == usual["limits"]
 
 
@@ -154,8 +146,8 @@ def test_without_orientation_no_north_is_claimed():
 
 def test_every_status_comes_with_advice():
     for status in Status:
-        assert advice(status, patterned=True).endswith(".")
-        missing = "reference stars" in advice(status, patterned=False)
+        assert pages.advice(status, patterned=True).endswith(".")
+        missing = "reference stars" in pages.advice(status, patterned=False)
         assert missing == (status is Status.MODEL_MISMATCH)
 
 
@@ -212,11 +204,11 @@ def test_extended_light_is_told_by_the_arrangement(places, reason):
 @pytest.mark.parametrize(
     ("write", "values", "text"),
     [
-        (plus_minus, (0.82345, 0.00213), "0.823 ± 0.002"),
-        (plus_minus, (149.64, 0.134), "149.64 ± 0.13"),
-        (plus_minus, (149.64, 13.4), "150 ± 13"), (plus_minus, (0.5, float("nan")), "0.500 ± nan"),
-        (scientific, (4.5e-6,), "4.5 × 10⁻⁶"), (scientific, (9.99e-6,), "1.0 × 10⁻⁵"),
-        (scientific, (0.0,), "0"),
+        (pages.plus_minus, (0.82345, 0.00213), "0.823 ± 0.002"),
+        (pages.plus_minus, (149.64, 0.134), "149.64 ± 0.13"),
+        (pages.plus_minus, (149.64, 13.4), "150 ± 13"), (pages.scientific, (0.0,), "0"),
+        (pages.plus_minus, (0.5, float("nan")), "0.500 ± nan"),
+        (pages.scientific, (4.5e-6,), "4.5 × 10⁻⁶"), (pages.scientific, (9.99e-6,), "1.0 × 10⁻⁵"),
     ],
 )  # fmt: skip
 def test_errors_decide_on_the_digits(write, values, text):
@@ -224,7 +216,7 @@ def test_errors_decide_on_the_digits(write, values, text):
 
 
 def test_probabilities_of_false_alarms():
-    assert [probability(p) for p in (0.25, 3e-5, 1e-300)] == ["0.25", "3.0 × 10⁻⁵", "< 10⁻⁹"]
+    assert [pages.probability(p) for p in (0.25, 3e-5, 1e-300)] == ["0.25", "3.0 × 10⁻⁵", "< 10⁻⁹"]
     (row,) = summarise(reduction())["candidates"]
     assert row["snr"] > 8
     assert 0 <= row["false_alarm_probability"] < 1e-9
@@ -232,7 +224,7 @@ def test_probabilities_of_false_alarms():
     unknown = replace(reduction().detection, false_alarm=np.array([np.nan]))
     (row,) = summarise(replace(reduction(), detection=unknown))["candidates"]
     assert row["false_alarm_probability"] is None
-    assert probability(None) == "not stated"
+    assert pages.probability(None) == "not stated"
 
 
 def test_the_summary_has_the_numbers_of_the_result(folder):
@@ -260,7 +252,7 @@ def test_the_summary_has_the_numbers_of_the_result(folder):
     assert summary["sentence"] in page.replace("\u00a0", " ")
     words = Tags(page).words
     at = words.index("Astrometry and photometry")
-    offset = plus_minus(entry["delta_ra_arcsec"], entry["delta_ra_error_arcsec"])
+    offset = pages.plus_minus(entry["delta_ra_arcsec"], entry["delta_ra_error_arcsec"])
     assert offset in words[at:]
     assert "Flux density (Jy)" not in words
 
@@ -273,7 +265,7 @@ def test_calibrated_frames_have_flux_densities_on_the_page():
     summary["candidates"][0] |= {"flux_density_Jy": 1.2e-4, "flux_density_error_Jy": 1e-5}
     words = Tags(page(summary, ReportPictures())).words
     assert "0.41 ± 0.05 Jy, from its diffracted light" in words
-    assert scientific(1.2e-4, 1e-5) in words
+    assert pages.scientific(1.2e-4, 1e-5) in words
 
 
 def test_every_picture_has_words_and_nothing_is_loaded(folder):
@@ -286,7 +278,8 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
         assert (attributes["src"] or "").startswith("data:image/png;base64,")
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
     assert all((a.get("src") or "data:").startswith("data:") for _, a in page.tags)
-    assert Picture("", drawing.panel()[0], "", "").uri.startswith("data:image/png;base64,iVBOR")
+    picture = pages.Picture("", drawing.panel()[0], "", "")
+    assert picture.uri.startswith("data:image/png;base64,iVBOR")
     # Links are to the files beside it.
     linked = {a["href"] for _, a in page.tags if "href" in a}
     assert linked == {each.name for each in folder.iterdir()}
@@ -475,9 +468,9 @@ def test_the_report_says_who_is_deeper_where(klip, said):
     other = {
         "separation_arcsec": [0.4, 0.8, 1.2], "contrast": klip, "small_sample": [2e-4, 1e-5, 1e-5]
     }  # fmt: skip
-    assert said in depth_against_klip(curve, other)
-    assert depth_against_klip(curve, None) == ""
-    assert depth_against_klip(curve | {"separation_arcsec": [0.1, 0.2]}, other) == ""
+    assert said in pages.depth_against_klip(curve, other)
+    assert pages.depth_against_klip(curve, None) == ""
+    assert pages.depth_against_klip(curve | {"separation_arcsec": [0.1, 0.2]}, other) == ""
 
 
 @pytest.mark.slow

@@ -9,6 +9,9 @@ separation. Both are fitted to the map itself,
 where q is the star's light over the noise, weighted with the image of the planet, and g a Gaussian
 process. The fit also says how well f is known at each position: noise in units of the multiplied
 errors follows Student's t, and the threshold of a search has to be higher.
+
+In a single roll, compact structures of the flat-field pattern pass for planets. Their S/N is added
+to f in quadrature.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import binary_dilation, convolve, map_coordinates, maximum_filter
 from torch import Tensor
 
 from pyklip_diffrender.detection.field import (
@@ -42,6 +45,7 @@ __all__ = [
     "ErrorFactor",
     "Scatter",
     "Significance",
+    "compact_structures",
     "contrast_table",
     "described",
     "structures_in_single_roll",
@@ -103,6 +107,28 @@ def structures_in_single_roll(snr: ArrayLike) -> Image:
     """Probability that a structure of the detector makes a peak above an S/N anywhere in a roll."""
     number = _STRUCTURES * np.exp((_STRUCTURES_ABOVE - np.asarray(snr)) / _STRUCTURES_FALL)
     return np.asarray(-np.expm1(-number))
+
+
+_COMPACT = 4.0
+"""Standard deviations by which the sum of a compact structure exceeds those of other places."""
+
+
+def compact_structures(pattern: Image, width: float) -> Image:
+    """The part of a pattern, (ny, nx), that is in structures as compact as a point source.
+
+    Errors of the flat field are independent from pixel to pixel. Where neighbours agree over the
+    width of a point source, pixels, the star's image has light that the model lacks.
+    """
+    # Sums over the image of a point source, whose scatter is that of the flat field's errors.
+    reach = math.ceil(width)
+    steps = np.arange(-reach, reach + 1) ** 2
+    squares = np.add.outer(steps, steps)
+    point = np.exp(-4 * math.log(2) * squares / width**2)
+    sums = convolve(pattern, point, mode="constant")
+    scatter = math.sqrt(float(np.median(sums**2)) / _MEDIAN)
+    peaks = (sums == maximum_filter(sums, size=2 * reach + 1)) & (sums > _COMPACT * scatter)
+    near = binary_dilation(peaks, squares <= width**2)
+    return np.where(near, pattern, 0.0)
 
 
 @dataclass(frozen=True)
@@ -357,12 +383,16 @@ class Significance:
     least: float = 1.0  # Smallest factor by which errors are multiplied.
     # Whether the factor follows the scatter of the map. Otherwise it is `least`.
     measured: bool = True
+    # (ny, nx), S/N of planets that structures of the detector may be taken for, before errors are
+    # multiplied.
+    structures: Image | float = 0.0
 
     def factor(self, snr: Image, sources: Tensor | Image) -> ErrorFactor:
         """Factor for the errors of a map with sources at x, y, (k, 2), arcsec."""
         if not self.measured:
             return ErrorFactor.constant(self.least)
-        return self._scatter.factor(snr, sources).at_least(self.least)
+        factor = self._scatter.factor(snr, sources).at_least(self.least)
+        return replace(factor, factors=np.hypot(factor.factors, self.structures))
 
     @cached_property
     def _scatter(self) -> Scatter:
@@ -400,8 +430,9 @@ class Significance:
             if self.measured
             else itertools.repeat((self.least, math.inf))
         )
+        structures = np.broadcast_to(self.structures, snr.shape)
         for peak, (scatter, freedom) in zip(peaks, alone, strict=False):
-            height = float(snr[peak]) / max(scatter, self.least)
+            height = float(snr[peak]) / math.hypot(max(scatter, self.least), structures[peak])
             sigmas = float(self.sigmas(height, freedom))
             if sigmas >= threshold:
                 yield peak, sigmas

@@ -346,6 +346,7 @@ def significance_of(
 
     `inner` is the smallest separation of a source, arcsec; `scatter` replaces the factor.
     """
+    measured = scatter is None and follows_scatter(fits)
     return Significance(
         maps.grid,
         maps.starlight,
@@ -353,7 +354,8 @@ def significance_of(
         inner,
         fits[0].model.resolution,
         error_inflation(fits, maps.groups, sources) if scatter is None else scatter,
-        scatter is None and follows_scatter(fits),
+        measured,
+        maps.structures if measured else 0.0,
     )
 
 
