@@ -99,8 +99,7 @@ def test_psf_writes_the_image_of_the_model(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pyklip_diffrender.instrument.nircam.nircam_coronagraph", small)
     path = tmp_path / "star.fits"
     opd = opd_file(tmp_path / "opd.fits")
-    options = ["--monochromatic", "4.5e-6", "--size", "20", "--opd", str(opd)]
-    arguments = ["psf", "-o", str(path), *options]
+    arguments = f"psf -o {path} --monochromatic 4.5e-6 --size 20 --opd {opd}".split()
     path.write_text("mine")
     assert main(arguments) == 1
     assert re.search(rf"{re.escape(str(path))}.*--overwrite", capsys.readouterr().err)

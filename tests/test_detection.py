@@ -20,6 +20,7 @@ import pyklip_diffrender as dr
 from benchmarks.noisy_stars import drift, drifted_star
 from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.detection.candidates import with_companions
+from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics import PupilGrid
@@ -361,6 +362,18 @@ def test_rolled_frames_share_the_star_and_turn_the_planet(world):
     assert joint["contrast_error"] < separate["contrast_error"]
     (wrong,) = dr.measure(together, [replace(FAINT, position_angle=70.0).offset])
     assert wrong["snr"] < 0.6 * joint["snr"]
+
+
+@pytest.mark.parametrize(("rolls", "left", "count"), [(2, 1, 1), (2, 9, 0), (1, 1, 0)])
+def test_side_lobes_do_not_hide_their_source(world, monkeypatch, rolls, left, count):
+    """They raise the scatter by which it is judged, and go with it."""
+    frames = [world.observed(world.expected(FAINT.rotated(-a)), 5, position_angles=np.array([a]))
+              for a in (0.0, 10.0)[:rolls]]  # fmt: skip
+    fit = world.refined(frames)
+    high = dr.measure(fit, [FAINT.offset])[0]["snr"] / 4.5
+    monkeypatch.setattr(Significance, "factor", lambda self, snr, sources: ErrorFactor.constant(
+        left if len(sources) else high))  # fmt: skip
+    assert len(dr.detect(fit).candidates) == count
 
 
 def test_a_reference_star_helps_and_shows_no_planet(world):

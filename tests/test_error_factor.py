@@ -9,13 +9,11 @@ from scipy.ndimage import gaussian_filter
 
 from pyklip_diffrender.detection import error_factor
 
-PIXEL = 0.06
-RESOLUTION = 0.15
+PIXEL, RESOLUTION = 0.06, 0.15
 SMOOTH = 1.1
 """Standard deviation of the Gaussian that makes noise as smooth as a map of S/N, pixels."""
 
 NOTHING = np.zeros((0, 2))
-
 
 AXIS = PIXEL * (np.arange(80) - 79 / 2)
 GRID = np.stack(np.meshgrid(AXIS, AXIS), axis=-1)

@@ -44,14 +44,12 @@ def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(mask, filter_nam
 
 def test_another_mask_brings_its_own_aberrations():
     masks = ("MASK210R", "MASK335R", "MASK430R")
-    tables = {
-        mask: instrument.internal_wavefront_error(mask, short_wave=mask == "MASK210R")
-        for mask in masks
-    }
+    wavefront = instrument.internal_wavefront_error
+    tables = {mask: wavefront(mask, short_wave=mask == "MASK210R") for mask in masks}
     rms = {mask: float(table[3:].norm() * 1e9) for mask, table in tables.items()}
     # The official table's column WFE_RMS, nm: of the lit part of the pupil, not of the circle.
     assert rms == pytest.approx({"MASK210R": 161, "MASK335R": 176, "MASK430R": 171}, rel=0.02)
-    flipped = instrument.internal_wavefront_error("MASK335R", flip=False)
+    flipped = wavefront("MASK335R", flip=False)
     changed = (flipped != tables["MASK335R"]).nonzero().flatten() + 1
     # Noll's sines, which change sign with y: all odd ones that are not round.
     assert changed.tolist() == [j for j in range(3, 36, 2) if j != 11]

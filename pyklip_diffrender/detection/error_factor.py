@@ -418,13 +418,7 @@ class Significance:
 
         The significance is the number of standard deviations that Gaussian noise exceeds as rarely.
         """
-        factor = self.factor(snr, sources)
-        # A source raises the scatter by which it is measured: it counts for a position or two.
-        raised = np.sqrt(1 + _POSITIONS * CLIP**2 / factor.freedom)
-        scaled = raised * snr / factor.factors
-        allowed = allowed & reaching(self.grid, self.inner)
-        allowed &= far_from(self.grid, sources, pixel_width(self.grid))
-        peaks = local_maxima(scaled, allowed, threshold, size=3)[:_JUDGED]
+        peaks = self.peaks(snr, sources, threshold, allowed)
         alone = (
             self._scatter.judged(snr, sources, peaks)
             if self.measured
@@ -436,6 +430,18 @@ class Significance:
             sigmas = float(self.sigmas(height, freedom))
             if sigmas >= threshold:
                 yield peak, sigmas
+
+    def peaks(
+        self, snr: Image, sources: Tensor | Image, threshold: float, allowed: NDArray[np.bool_]
+    ) -> list[Peak]:
+        """Peaks above a threshold that may be significant, the highest first; see `next_peak`."""
+        factor = self.factor(snr, sources)
+        # A source raises the scatter by which it is measured: it counts for a position or two.
+        raised = np.sqrt(1 + _POSITIONS * CLIP**2 / factor.freedom)
+        scaled = raised * snr / factor.factors
+        allowed = allowed & reaching(self.grid, self.inner)
+        allowed &= far_from(self.grid, sources, pixel_width(self.grid))
+        return local_maxima(scaled, allowed, threshold, size=3)[:_JUDGED]
 
     @staticmethod
     def sigmas(snr: ArrayLike, freedom: ArrayLike) -> Image:

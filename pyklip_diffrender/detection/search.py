@@ -175,6 +175,11 @@ _STEPS = 6
 """Largest number of steps of the positions while candidates are added or dropped. Point sources
 settle in these; parts of something extended do not, and would take most of the time."""
 
+_HIDDEN = 0.8
+"""Part of the threshold above which a peak in several rolls is tried as a candidate though its S/N
+is below: the side lobes of a source raise the scatter by which it is judged. In a single roll, the
+light of structures of the detector would pass."""
+
 _SOURCE = 5.0
 """S/N above which `measure` removes a source before it computes the default `scatter`."""
 
@@ -591,11 +596,19 @@ class _PeakSearch:
         """Make the highest peak that is left a candidate; None if none is significant."""
         grid, candidates = self.maps.grid, peaks.candidates
         allowed = far_from(grid, peaks.dismissed, 2 * pixel_width(grid)) & ~peaks.within
+        if max(len(candidates), len(peaks.dismissed)) >= _MAX_CANDIDATES:
+            return None
         peak = significance.next_peak(snr, candidates.offsets, self.threshold, allowed)
-        if peak is None or max(len(candidates), len(peaks.dismissed)) >= _MAX_CANDIDATES:
+        is_significant = peak is not None
+        if peak is None and count_rolls(self.fits) > 1:
+            lowest = _HIDDEN * self.threshold
+            peak = next(iter(significance.peaks(snr, candidates.offsets, lowest, allowed)), None)
+        if peak is None:
             return None
         contrast = float(snr[peak] / np.sqrt(self.maps.information[peak]))
         more = self._fitted(candidates.with_one_more(grid[peak], contrast))
+        if not is_significant and not self._is_significant(more, significance):
+            return None
         within = peaks.within
         if separation_of(more.offsets.numpy())[-1] < self.inner:
             within = within.copy()
@@ -603,6 +616,13 @@ class _PeakSearch:
             more = self._fitted(more.without(len(more) - 1))
         _log.info("candidates at %s arcsec", more.offsets.tolist())
         return replace(peaks, candidates=more, within=within)
+
+    def _is_significant(self, candidates: Candidates, significance: Significance) -> bool:
+        """Whether the last candidate is significant where the light of all of them is removed."""
+        snr = self.maps.snr(self.maps.without(candidates))
+        factor = significance.factor(snr, candidates.offsets)
+        margin = candidates.snr(factor) - factor.threshold(self.threshold, candidates.offsets)
+        return bool(margin[-1] >= 0)
 
     def _dropped(self, peaks: _Peaks, snr: Image, factor: ErrorFactor) -> _Peaks | None:
         """Drop the weakest candidate that is none with the present factor; None if all are."""

@@ -19,7 +19,6 @@ pytestmark = pytest.mark.hard
 QUICK = ("saturated core, flagged", "bright planet, 1e-3")
 """One of each kind: the others need ``--full``."""
 
-
 BY_HAND = ("the start transposed", "the start mirrored", "5 % of the pixels missing")
 """Only in `benchmarks.stability`: of the kind of harder ones that are tested."""
 
