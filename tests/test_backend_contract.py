@@ -160,7 +160,7 @@ import pyklip_diffrender as dr
 def work(_):
     from pyklip import parallelized
     from pyklip_diffrender.pyklip_backend import is_registered
-    assert not pyklip_backend.is_registered()
+    assert not is_registered()
     warnings.simplefilter("error")
     try:
         parallelized.klip_dataset(None, algo="klip")
