@@ -10,8 +10,8 @@ where q is the star's light over the noise, weighted with the image of the plane
 process. The fit also says how well f is known at each position: noise in units of the multiplied
 errors follows Student's t, and the threshold of a search has to be higher.
 
-In a single roll, compact structures of the flat-field pattern pass for planets. Their S/N is added
-to f in quadrature.
+In a single roll, compact structures of the flat-field pattern pass for planets. The S/N that they
+have as planets, with errors that are not multiplied, is added to f in quadrature.
 """
 
 from __future__ import annotations
