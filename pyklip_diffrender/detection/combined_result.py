@@ -16,6 +16,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
+from pyklip_diffrender.detection.association import Hypotheses, Motion
 from pyklip_diffrender.detection.field import (
     Image,
     Positions,
@@ -23,24 +24,12 @@ from pyklip_diffrender.detection.field import (
     separation_of,
 )
 from pyklip_diffrender.detection.measurement import magnitudes
-from pyklip_diffrender.detection.sky_map import Hypotheses, Motion, SkyMap, SkyStack
+from pyklip_diffrender.detection.sky_map import SkyMap, SkyStack
 from pyklip_diffrender.instrument.spectrum import PlanetSpectra
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement.fit_file import text_hdu
-
-__all__ = [
-    "COMBINED",
-    "FREE",
-    "Combination",
-    "CombinedSource",
-    "candidates_table",
-    "limits_table",
-    "scales_of",
-    "star_of_filter",
-    "unmoved",
-]
 
 COMBINED = {
     "combined.fits": "maps of the combined search",
@@ -71,6 +60,8 @@ class CombinedSource:
     chi2: float  # Of the fluxes about the best listed spectrum; NaN without one.
     fluxes: SkyStack  # At the place, (filters,).
     hypotheses: Hypotheses | None
+    # Date (MJD), place (2,) and covariance (2, 2) at each epoch where it was seen.
+    sightings: tuple[tuple[float, Image, Image], ...]
 
 
 @dataclass(frozen=True, eq=False)
