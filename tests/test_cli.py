@@ -21,8 +21,8 @@ import pytest
 import torch
 from astropy.io import fits
 from small_files import calints
-from synthetic_searches import searched, write_searched
 
+from benchmarks.synthetic_searches import searched, write_searched
 from pyklip_diffrender import errors
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.cli.session import Run

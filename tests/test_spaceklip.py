@@ -10,9 +10,9 @@ import torch
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
 from small_files import calints as small_calints
-from synthetic_searches import searched
 
 from benchmarks.calints_files import calints
+from benchmarks.synthetic_searches import searched
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Candidates, Detection
 from pyklip_diffrender.detection.error_factor import ErrorFactor

@@ -14,11 +14,11 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
 from survey_stubs import HOSTILE, Tags, configuration, inputs, result, stub
-from synthetic_searches import searched, write_searched
 
 import pyklip_diffrender as dr
 from benchmarks import faults
 from benchmarks.calints_files import CENTER, SIDE, calints
+from benchmarks.synthetic_searches import searched, write_searched
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.surveys import execution

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import click
 
 from pyklip_diffrender.cli.session import Run, config_remark, free_memory, with_options
-from pyklip_diffrender.detection import COMBINED, Combination
+from pyklip_diffrender.detection import COMBINED, Combination, checked_motion
 from pyklip_diffrender.detection.recovery import TOGETHER
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
@@ -41,7 +41,6 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.scene.exposure import proper_motion as motion_of
 from pyklip_diffrender.scene.sequence import SHORT, Sequence
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
@@ -190,8 +189,8 @@ def run_reduction(
     opd_date: Rule | None,
     star_sed: str | None,
     spectra: tuple[str, ...] = (),
-    proper_motion: tuple[float, float] | None = None,
-    parallax: float | None = None,
+    proper_motion: tuple[str, str] | None = None,
+    parallax: str | None = None,
     **options: Any,
 ) -> None:
     """Reduce the epochs and filters of a target, write all products and say what they show.
@@ -206,6 +205,7 @@ def run_reduction(
         raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
     try:
         accuracy: Accuracy = "quick" if quick else ReduceOptions.accuracy
+        checked_motion(proper_motion, parallax)
         checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
         raise click.UsageError(with_options(str(error)) + config_remark()) from error
@@ -270,14 +270,13 @@ def run_reduction(
         if overwrite:
             _remove_others(output, folders)
         if several:
-            first = sequences[0].science[0]
-            motion = proper_motion or motion_of(first.header, first.name)
             combination = search_together(
-                folders, spectra=spectra or SPECTRA, star=star_sed, motion=motion, parallax=parallax
-            )
+                folders, spectra=spectra or SPECTRA, star=star_sed, motion=proper_motion,
+                parallax=parallax,
+            )  # fmt: skip
             if isinstance(combination, str):
                 combination = with_options(combination)
-            page, data = write_comparison(summaries, motion, output, combination)
+            page, data = write_comparison(summaries, output, combination)
             summary = loads(read_text(data))
             if isinstance(combination, Combination):
                 combination.write(output, overwrite=overwrite or resume)

@@ -637,12 +637,10 @@ together = _all(
                 "repeated: black bodies of 150 to 1,500 K, the same flux density in all filters, "
                 "any fluxes, or a table of spectra with the wavelength (micron) in the first "
                 "column. Default: blackbody, flat and free."),
-    option("--proper-motion", type=float, nargs=2, metavar="EAST NORTH",
-           section="Filters and epochs",
-           help="Proper motion of the star, arcsec per year, to tell companions from background "
-                "sources; default: that of the headers."),
-    option("--parallax", type=click.FloatRange(min=0), metavar="ARCSEC",
-           section="Filters and epochs",
-           help="Parallax of the star, for the motion of background sources and of orbits between "
-                "epochs; default: neglected."),
+    option("--proper-motion", nargs=2, metavar="EAST NORTH", section="Filters and epochs",
+           help='Proper motion of the star, to tell companions from background sources: arcsec per '
+                'year, or with a unit, such as "377 mas/yr". Default: that of the headers.'),
+    option("--parallax", metavar="ANGLE", section="Filters and epochs",
+           help='Parallax of the star, for the motion of background sources and of orbits between '
+                'epochs: arcsec, or with a unit, such as "45 mas". Default: neglected.'),
 )  # fmt: skip

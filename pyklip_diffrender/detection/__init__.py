@@ -9,7 +9,7 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 from __future__ import annotations
 
 from pyklip_diffrender.detection import metrics
-from pyklip_diffrender.detection.association import Hypotheses, Motion
+from pyklip_diffrender.detection.association import Hypotheses, Motion, checked_motion
 from pyklip_diffrender.detection.candidates import (
     Candidates,
     ReferenceSource,
@@ -49,6 +49,7 @@ __all__ = [
     "ReferenceSource",
     "SkyMap",
     "WideField",
+    "checked_motion",
     "combine",
     "combine_frames",
     "completeness",

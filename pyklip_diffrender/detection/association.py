@@ -132,7 +132,9 @@ class Motion:
         return np.asarray(2 * math.pi * np.sqrt(self.mass / au) * self.parallax)
 
 
-def checked_motion(proper: Any, parallax: Any, mass: Any) -> tuple[Any, float, float]:
+def checked_motion(
+    proper: Any, parallax: Any, mass: Any = 1.0
+) -> tuple[tuple[float, float] | None, float, float]:
     """Convert the motion of a star to arcsec per year, arcsec and solar masses.
 
     Two exact zeros, as in an empty proposal, are a proper motion that is not known (None), and so

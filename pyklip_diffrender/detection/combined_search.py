@@ -43,6 +43,7 @@ from pyklip_diffrender.detection.combined_result import (
     candidates_table,
     limits_table,
     scales_of,
+    sightings_table,
     star_of_filter,
     unmoved,
 )
@@ -217,6 +218,7 @@ def combine(
             jansky=unit == "Jy",
             dated=maps[0].mjd is not None,
         ),
+        sightings=sightings_table(sources),
         limits=limits_table(stack, family, searcher.stars, searcher.grid, level=limit, inner=inner),
         grid=searcher.grid,
         snr=np.where(np.isfinite(stack.error).any(axis=0), snr, np.nan),

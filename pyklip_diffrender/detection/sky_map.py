@@ -156,11 +156,11 @@ class SkyMap:
         return Positions(np.zeros((0, 2)), np.zeros((0, 2, 2)), self.north)._to_sky
 
     @cached_property
-    def _splines(self) -> tuple[Image, Image]:
-        """Coefficients of the S/N, and of the Gaussian standard deviations that are as rare."""
+    def _splines(self) -> tuple[Image, ...]:
+        """Coefficients of the S/N, and of the Gaussian standard deviations if they differ."""
         first = spline_filter(self.snr, order=_ORDER)
         if not np.isfinite(self.freedom).any():
-            return first, first
+            return (first,)
         return first, spline_filter(_gaussian(self.snr, self.freedom), order=_ORDER)
 
     def _freedom_at(self, place: Image) -> float:
@@ -187,14 +187,15 @@ class SkyMap:
         pixel = [rows, columns]
         information = map_coordinates(self._information, pixel, order=1, mode="nearest")
         known = inside & (information > 0)
-        snr, sigmas = (
+        values = [
             np.where(
                 known,
                 map_coordinates(each, pixel, order=_ORDER, mode="mirror", prefilter=False),
                 0.0,
             )
             for each in self._splines
-        )
+        ]
+        snr, sigmas = values[0], values[-1]
         error = np.where(known, np.where(known, information, 1.0) ** -0.5, np.inf)
         return snr.reshape(shape), sigmas.reshape(shape), error.reshape(shape)
 

@@ -23,7 +23,6 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.scene.exposure import proper_motion
 from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staging
 
 __all__ = ["FOLDER", "StarSearch", "search_stars"]
@@ -132,9 +131,7 @@ def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None
     final.parent.mkdir(exist_ok=True)
     clean(final.parent)
     detections = [each for _, each in group]
-    motions = [proper_motion(each.observation.header, each.observation.name) for each in detections]
-    motion = next((each for each in motions if each is not None), None)
-    combination = search_together(detections, spectra=spectra, motion=motion)
+    combination = search_together(detections, spectra=spectra)
     _log.info("%s: %s", star, in_words(combination))
     jobs = final.parent.parent / "jobs"
     summaries = {
@@ -146,7 +143,7 @@ def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None
     try:
         if isinstance(combination, Combination):
             combination.write(folder)
-        write_comparison(summaries, motion, folder, combination)
+        write_comparison(summaries, folder, combination)
         os.rename(folder, final)
     except OSError:
         # Another survey of the folder may have been faster.
