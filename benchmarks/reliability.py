@@ -24,6 +24,7 @@ from astropy.time import Time
 
 import pyklip_diffrender as dr
 from benchmarks.synthetic_searches import found
+from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Motion
 
 YEAR = 365.25
@@ -152,10 +153,12 @@ def main():
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--systems", type=int, default=40)
+    parser.add_argument("--figure", type=Path)
     options = parser.parse_args()
-    rows = []
+    rows, results = [], []
     for name, (epochs, filters) in SETS.items():
         result = reliability([system(seed, epochs, filters) for seed in range(options.systems)])
+        results.append(result)
         for low, high in itertools.pairwise(EDGES):
             top = result.stated <= high if high == 1 else result.stated < high
             chosen = (result.stated >= low) & top
@@ -178,6 +181,26 @@ def main():
         table[name].info.format = ".4f"
     table.write(options.output, format="ascii.ecsv", overwrite=True)
     table.pprint_all()
+    if options.figure is not None:
+        draw(results, options.figure)
+
+
+def draw(results, path):
+    """Draw the frequency with which hypotheses are true, by their probability."""
+    stated = np.concatenate([each.stated for each in results])
+    true = np.concatenate([each.true for each in results])
+    figure, ax = drawing.panel()
+    ax.plot([0, 1], [0, 1], "--", color=drawing.figures.INK, lw=1)
+    for low, high in itertools.pairwise(EDGES):
+        chosen = (stated >= low) & (stated <= high if high == 1 else stated < high)
+        # The error is that of the expected share, so that a share of 0 or 1 has one, too.
+        mean, share = stated[chosen].mean(), true[chosen].mean()
+        error = np.sqrt(mean * (1 - mean) / chosen.sum())
+        ax.errorbar(mean, share, error, fmt="o", color=drawing.figures.ACCENT, capsize=2)
+    ax.set_xlabel("stated probability")
+    ax.set_ylabel("share that is true")
+    ax.set_box_aspect(1.0)
+    drawing.save(figure, path)
 
 
 if __name__ == "__main__":
