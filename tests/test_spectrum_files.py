@@ -8,7 +8,7 @@ import pytest
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import Column, MaskedColumn, QTable, Table
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import pyklip_diffrender as dr
@@ -177,6 +177,8 @@ STYLES = {
 def test_any_order_of_columns_and_rows(
     tmp_path_factory, place, level, style, order, comma, label, seed
 ):
+    # Without brackets, a blank ends the unit.
+    assume(" " not in level or style in ("brackets", "square", "close"))
     name = STYLES[style].format
     columns = [
         (name(label="wave", unit=place), PLACES[place]),
@@ -331,7 +333,7 @@ def test_spellings_of_units():
     for text_, unit in (
         ("ANGSTROMS", u.AA), ("Microns", u.um), ("NM", u.nm), ("GHZ", u.GHz), ("mjy", u.mJy),
         ("MJy", u.MJy), ("PHOTLAM", u.photon / u.s / u.cm**2 / u.AA), ("[Jy]", u.Jy),
-        ("\u00b5m", u.um), ("\u00c5", u.AA), ("MAG(AB)", u.ABmag),
+        ("\u00b5m", u.um), ("\u00c5", u.AA), ("MAG(AB)", u.ABmag), ("AB", u.ABmag),
         ("10**-17 erg/s/cm2/A", 1e-17 * u.erg / u.s / u.cm**2 / u.AA),
     ):  # fmt: skip
         assert unit_of(text_) == unit, text_

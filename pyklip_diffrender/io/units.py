@@ -209,9 +209,10 @@ def unit_of(text: str) -> u.UnitBase | None:
     "A" is Angstrom, "S" the second, and "4.4um" a value. UnitError for "MJY", mJy or MJy.
     """
     text = text.strip(" []")
-    system = re.fullmatch(r"mag[\s_]*\(?(ab|st)\)?|(ab|st)[\s_]*mag", text, re.IGNORECASE)
+    # Also without "mag": astropy's AB is a flux density, of magnitude 0.
+    system = re.fullmatch(r"(?i)(?:mag)?[\s_]*\(?(ab|st)\)?[\s_]*(?:mag)?", text)
     if system:
-        return {"AB": u.ABmag, "ST": u.STmag}[(system[1] or system[2]).upper()]
+        return u.ABmag if system[1].upper() == "AB" else u.STmag
     words = r"(?<![\d.])[^\W\d_]+"
     text = re.sub(words, lambda word: _SPELLED.get(word[0], word[0]), text)
     if re.search(r"\bMJY\b", text):
