@@ -119,6 +119,13 @@ FILES = {
         "ascii.ipac", wavelength=with_unit(MICRON, "micron"), flux=with_unit(JANSKY, "Jy"),
     )),
     "CALSPEC": ("star.fits", CALSPEC),
+    "model of CALSPEC": ("star_mod.fits", as_fits(
+        ("WAVELENGTH", "ANGSTROMS", 1e4 * MICRON), ("CONTINUUM", "FLAM", 1.1 * FLAM),
+        ("FLUX", "FLAM", FLAM),
+    )),
+    "flags": (
+        "star.txt", text("# wave_um quality star_mJy\n", MICRON, 0 * MICRON, 1e3 * JANSKY),
+    ),
     "x1d": ("star_x1d.fits", as_fits(
         ("WAVELENGTH", "um", MICRON), ("FLUX", "Jy", JANSKY), ("FLUX_ERROR", "Jy", 0.1 * JANSKY),
         ("FLUX_VAR_POISSON", "Jy2", JANSKY**2), ("SURF_BRIGHT", "MJy/sr", 1e2 * JANSKY),
@@ -217,6 +224,7 @@ def test_any_order_of_columns_and_rows(
         # No flux densities.
         ("# wave_um flux (cts/s)\n", (MICRON, JANSKY), ["(cts/s)", "one column of flux densities"]),
         ("# wave_um flux [bananas]\n", (MICRON, JANSKY), ["(bananas)", "one column of flux"]),
+        ("# wave_um log_flux_Jy\n", (MICRON, 2 + JANSKY), ["(logarithm)", "one column of flux"]),
         ("# wave_um Kmag\n", (MICRON, 5 + JANSKY), ["Kmag (mag)", "one column of flux densities"]),
         ("# wave_um mag_vega\n", (MICRON, 5 + JANSKY), ["mag_vega (mag)", "one column of flux"]),
         ("# wave_um MJy/sr\n", (MICRON, JANSKY), ["MJy/sr (MJy / sr)", "one column of flux"]),

@@ -412,13 +412,12 @@ def _columns(path: Path, expected: str) -> tuple[Column, list[Column]]:
         )
         raise CorruptFileError(
             f"{path}: not a table of numbers{reason}; expected wavelengths and flux densities in "
-            "columns of text, FITS or VOTable"
+            "columns of text, with # before each comment, of FITS or of a VOTable"
         ) from error
     named = [each for each in columns if _IS_PLACE.match(each.name)]
     spectral = [each for each in columns if _is(each.unit, _PLACES)]
-    both = [each for each in spectral if _IS_PLACE.match(each.name)]
     first = [each for each in columns[:1] if each.unit is None]
-    group = next((each for each in (both, named, spectral, first) if each), [])
+    group = next((each for each in (named, spectral, first) if each), [])
     if len(group) != 1:
         raise _unclear(path, columns, "one column of wavelengths")
     place = group[0]
@@ -486,6 +485,8 @@ def _unit_of(column: Any) -> u.UnitBase | None:
 
 def _unit_in(name: str) -> u.UnitBase | None:
     """Unit in the name of a column, or in a word of a comment."""
+    if re.match(r"(?i)log(10)?[_( ]", name):
+        return u.UnrecognizedUnit("logarithm")
     bracket = re.search(r"[\[(](.+)[\])]$", name)
     starts = [0, *(each.end() for each in re.finditer(r"[\s_/]+", name))]
     for text in [name, bracket[1]] if bracket else [name[start:] for start in starts]:
