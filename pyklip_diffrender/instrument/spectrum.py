@@ -284,7 +284,7 @@ def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
     between 2 and 5.2 micron are too far apart for interpolation.
     """
     path = Path(path)
-    place, others = _columns(
+    axis, others = _columns(
         path,
         "a star's spectrum or photometry, or a spectral type and a K magnitude such as "
         '"A2V, K=6.77"',
@@ -293,12 +293,12 @@ def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
     named = [each for each in possible if re.match(r"(?i)(sed_)?flux(?![a-z])", each.name)]
     with_unit = [each for each in possible if each.unit is not None]
     level = next((group[0] for group in (named, possible, with_unit) if len(group) == 1), None)
-    if level is None or (place.unit is None) != (level.unit is None):
+    if level is None or (axis.unit is None) != (level.unit is None):
         expected = "one column of flux densities" if level is None else "units of both, or of none"
-        raise _unclear(path, [place, *others], expected)
+        raise _unclear(path, [axis, *others], expected)
     if level.unit is None:
         _log.warning("%s has no units; micron and Jy are assumed", path)
-    wavelength, flux = _samples(path, place, level)
+    wavelength, flux = _samples(path, axis, level)
     require_star(np.interp(_REFERENCE, wavelength, flux), f"{path}: {level.name}")
     used = (wavelength[1:] > _RANGE[0]) & (wavelength[:-1] < _RANGE[1])
     step = np.where(used, np.diff(wavelength) / wavelength[:-1], 0.0)
@@ -349,7 +349,7 @@ _STARS = (1e-6, 1e5)
 _REFERENCE = 3.2e-6
 """Wavelength in the middle of the filters, m."""
 
-_PLACES = ("length", "frequency", "wavenumber")
+_AXES = ("length", "frequency", "wavenumber")
 _DENSITIES = (
     "spectral flux density", "spectral flux density wav",
     "photon flux density", "photon flux density wav",
@@ -357,7 +357,7 @@ _DENSITIES = (
 _BRIGHTNESSES = ("surface brightness", "surface brightness wav")
 """Physical types of units."""
 
-_IS_PLACE = re.compile(r"(?i)(sed_)?(wave|freq|(w|wl|wvl|lam|lambda|nu)(?![a-z]))")
+_IS_AXIS = re.compile(r"(?i)(sed_)?(wave|freq|(w|wl|wvl|lam|lambda|nu)(?![a-z]))")
 """Beginning of the name of a column of wavelengths or frequencies."""
 
 _IS_ERROR = re.compile(
@@ -414,29 +414,29 @@ def _columns(path: Path, expected: str) -> tuple[Column, list[Column]]:
             f"{path}: not a table of numbers{reason}; expected wavelengths and flux densities in "
             "columns of text, with # before each comment, of FITS or of a VOTable"
         ) from error
-    named = [each for each in columns if _IS_PLACE.match(each.name)]
-    spectral = [each for each in columns if _is(each.unit, _PLACES)]
+    named = [each for each in columns if _IS_AXIS.match(each.name)]
+    spectral = [each for each in columns if _is(each.unit, _AXES)]
     first = [each for each in columns[:1] if each.unit is None]
     group = next((each for each in (named, spectral, first) if each), [])
     if len(group) != 1:
         raise _unclear(path, columns, "one column of wavelengths")
-    place = group[0]
+    axis = group[0]
     for each in columns:
-        kinds = _PLACES if each is place else (*_DENSITIES, *_BRIGHTNESSES)
+        kinds = _AXES if each is axis else (*_DENSITIES, *_BRIGHTNESSES)
         units = [unit for unit in mentioned if _is(unit, kinds)]
         if each.unit is None and units:
             if any(unit != units[0] for unit in units):
                 listed = ", ".join(map(str, units))
                 raise _unclear(path, columns, f"one such unit in the comments, not {listed}")
             each.unit = units[0]
-    if place.unit is None:
-        if re.match(r"(?i)(sed_)?(freq|nu)", place.name):
+    if axis.unit is None:
+        if re.match(r"(?i)(sed_)?(freq|nu)", axis.name):
             raise _unclear(path, columns, "a unit of frequencies")
         _require_overlap(
-            (np.nanmin(place), np.nanmax(place)), (1e6 * _RANGE[0], 1e6 * _RANGE[1]), "micron",
-            ("Angstrom", "nm", "m"), f"{path}: {place.name}, which has no unit",
+            (np.nanmin(axis), np.nanmax(axis)), (1e6 * _RANGE[0], 1e6 * _RANGE[1]), "micron",
+            ("Angstrom", "nm", "m"), f"{path}: {axis.name}, which has no unit",
         )  # fmt: skip
-    return place, [each for each in columns if each is not place]
+    return axis, [each for each in columns if each is not axis]
 
 
 def _table(path: Path) -> tuple[Table, list[str]]:
@@ -465,7 +465,7 @@ def _table(path: Path) -> tuple[Table, list[str]]:
             names = _NAME.findall(line)
             if (
                 len(names) == len(table.columns)
-                and any(_IS_PLACE.match(each) or _is(_unit_in(each), _PLACES) for each in names)
+                and any(_IS_AXIS.match(each) or _is(_unit_in(each), _AXES) for each in names)
                 and not re.search("[:=]", line)
             ):
                 table.rename_columns(table.colnames, names)
@@ -491,21 +491,21 @@ def _unit_in(name: str) -> u.UnitBase | None:
     starts = [0, *(each.end() for each in re.finditer(r"[\s_/]+", name))]
     for text in [name, bracket[1]] if bracket else [name[start:] for start in starts]:
         # A letter is a unit only of wavelengths: "flux_A" may be the flux of star A.
-        unit = unit_of(text) if bracket or len(text) > 1 or _IS_PLACE.match(name) else None
+        unit = unit_of(text) if bracket or len(text) > 1 or _IS_AXIS.match(name) else None
         # Parsecs are no unit of wavelengths.
         far = unit is not None and unit.is_equivalent(u.m) and unit > u.m
-        if _is(unit, (*_PLACES, *_DENSITIES, *_BRIGHTNESSES)) and not far:
+        if _is(unit, (*_AXES, *_DENSITIES, *_BRIGHTNESSES)) and not far:
             return unit
     if bracket:
         return u.UnrecognizedUnit(bracket[1])
     return u.mag if re.search(r"(?i)mag(nitude)?s?(?![a-z])", name) else None
 
 
-def _samples(path: Path, place: Column, level: Column) -> _Spectrum:
+def _samples(path: Path, axis: Column, level: Column) -> _Spectrum:
     """Wavelengths, m, increasing, and flux densities, Jy, or Jy/sr for surface brightnesses."""
-    x, y = native_float64(place), native_float64(level)
+    x, y = native_float64(axis), native_float64(level)
     usable = np.isfinite(x) & np.isfinite(y) & (x > 0)
-    wavelength = (x[usable] * (place.unit or u.micron)).to(u.m, u.spectral())
+    wavelength = (x[usable] * (axis.unit or u.micron)).to(u.m, u.spectral())
     # Shifted, not multiplied, because units of magnitudes take no product.
     unit = level.unit or u.Jy
     levels = y[usable] << (unit * u.sr if _is(unit, _BRIGHTNESSES) else unit)
@@ -610,14 +610,14 @@ def _spectra_in_file(
     path: Path, filters: Sequence[str]
 ) -> tuple[list[tuple[str, list[float]]], list[tuple[str, str]]]:
     """Names of the spectra and their means in filters; names of what is left out, and why."""
-    place, columns = _columns(path, '"blackbody", "flat", "free", or a table of spectra')
+    axis, columns = _columns(path, '"blackbody", "flat", "free", or a table of spectra')
     units = [each.unit for each in columns if each.unit is not None]
     rows, left_out = [], []
     for each in columns:
         try:
             if units and not _is(each.unit, (*_DENSITIES, *_BRIGHTNESSES)):
                 raise _unclear(path, [each], "flux densities")
-            grid, flux = _samples(path, place, each)
+            grid, flux = _samples(path, axis, each)
             rows.append(
                 (each.name, [mean_in_filter(grid, flux, name, each.name) for name in filters])
             )
