@@ -150,8 +150,11 @@ FILES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("packed", [False, True], ids=["", "gz"])
-@pytest.mark.parametrize("kind", FILES)
+@pytest.mark.parametrize(
+    ("kind", "packed"),
+    [(kind, False) for kind in FILES]
+    + [(kind, True) for kind in ("synphot", "ECSV", "CALSPEC", "VizieR")],
+)
 def test_one_star_in_every_format(tmp_path, kind, packed):
     name, write = FILES[kind]
     path = tmp_path / name
