@@ -4,6 +4,7 @@ import gzip
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from survey_stubs import configuration, inputs
@@ -111,8 +112,8 @@ ROWS = ["1 2", "2 0.8", "3 0.4", "4 0.3", "5 0.2", "6 0.1"]
 
 
 def as_votable(path):
-    gigahertz = 299792.458 / WAVELENGTH[::-1]
-    QTable({"sed_freq": gigahertz, "sed_flux": FLUX[::-1]}).write(path, format="votable")
+    gigahertz = 299792.458 / WAVELENGTH[::-1] * u.GHz
+    QTable({"sed_freq": gigahertz, "sed_flux": FLUX[::-1] * u.Jy}).write(path, format="votable")
 
 
 @pytest.mark.parametrize(

@@ -266,6 +266,10 @@ def _fits() -> list[Breakage]:
             "outliers",
         ),
         Breakage(
+            "spectrum-errors", "a column of errors is no spectrum",
+            "and each.ndim == 1 and not _is_error(each)", "and each.ndim == 1", "spectrum_files",
+        ),
+        Breakage(
             "no-map", "without a map the star's flux is uncertain by 40 %",
             "return _UNTIED if fit.initial.data.any() else _WITHOUT_MAP", "return _UNTIED",
             "star_flux",

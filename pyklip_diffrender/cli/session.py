@@ -612,8 +612,8 @@ search = _all(
     ),
     # A path that is not converted: shells complete files, and a name stays as it is.
     option("--star-sed", type=click.Path(), metavar="FILE", section="Brightness of the star",
-           help="Spectrum or photometry of the star, in place of --star-flux: two columns in "
-                "micron and Jy, a table with units, or a VOTable of VizieR's photometry viewer. "
+           help="Spectrum or photometry of the star, in place of --star-flux: a table in text, "
+                "FITS or VOTable with units; without any they are micron and Jy. "
                 'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
     option("--resume", is_flag=True, section="Output",
            help="Go on with a reduction that was interrupted: its fit and search are kept in the "
@@ -635,8 +635,8 @@ together = _all(
            section="Filters and epochs",
            help="Spectra of planets for the combined search of several filters or epochs; may be "
                 "repeated: black bodies of 150 to 1,500 K, the same flux density in all filters, "
-                "any fluxes, or a table of spectra with the wavelength (micron) in the first "
-                "column. Default: blackbody, flat and free."),
+                "any fluxes, or a table of spectra with a column of wavelengths. "
+                "Default: blackbody, flat and free."),
     option("--proper-motion", nargs=2, metavar="EAST NORTH", section="Filters and epochs",
            help='Proper motion of the star, to tell companions from background sources: arcsec per '
                 'year, or with a unit, such as "377 mas/yr". Default: that of the headers.'),

@@ -36,6 +36,7 @@ __all__ = [
     "fits_files",
     "is_fits_name",
     "open_fits",
+    "read_bytes",
     "read_image",
     "read_text",
     "replacing",
@@ -88,6 +89,12 @@ def fits_files(folder: str | os.PathLike[str]) -> list[Path]:
         for path in Path(folder).iterdir()
         if is_fits_name(path) and not path.name.startswith(".") and not path.is_dir()
     )
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Content of a file, or of what is in a gzipped one."""
+    with _unpacked(Path(path)) as file:
+        return file.read()
 
 
 def read_text(path: str | os.PathLike[str]) -> str:

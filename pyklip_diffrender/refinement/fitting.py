@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,8 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     ShapeError,
 )
+from pyklip_diffrender.instrument.spectrum import require_star
+from pyklip_diffrender.io.units import unit_of
 from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.annealing import Annealing
@@ -408,20 +411,27 @@ def jansky_per_unit(frame: FrameFit) -> float | None:
 def to_jansky(star_flux: float | str | u.Quantity) -> float:
     """Flux density of a star in Jy, from a number of Jy, a Quantity, an AB magnitude or text.
 
-    Raises `IncompatibleSetupError` for anything that is not a positive flux density.
+    Raises `IncompatibleSetupError` for anything that is not the flux density of a star.
     """
     try:
-        value = star_flux if isinstance(star_flux, u.Quantity) else u.Quantity(star_flux)
-        if value.unit == u.dimensionless_unscaled:
-            value = value * u.Jy
+        if isinstance(star_flux, str):
+            parts = re.fullmatch(r"\s*([-+.\d]+(?:[eE][-+]?\d+)?)\s*(.*)", star_flux)
+            if parts is None:
+                raise ValueError("no number")
+            unit = unit_of(parts[2]) if parts[2] else u.Jy
+            if unit is None:
+                raise ValueError("no unit")
+            value = float(parts[1]) << unit
+        else:
+            value = star_flux if hasattr(star_flux, "unit") else u.Quantity(star_flux, u.Jy)
         jansky = float(value.to_value(u.Jy))
     except (TypeError, ValueError) as error:  # Units that cannot be converted are TypeErrors.
         raise IncompatibleSetupError(
-            f"star_flux: got {star_flux!r}, expected a flux density such as '0.45 Jy' or "
-            "an AB magnitude (9.8 * u.ABmag)"
+            f"star_flux: got {star_flux!r}, expected a flux density per frequency, such as "
+            "'0.45 Jy' or '403 mJy', or an AB magnitude, such as '9.8 mag(AB)'. A Vega magnitude "
+            "is not converted; a spectrum is, see star_flux_density (--star-sed)"
         ) from error
-    if not 0 < jansky < np.inf:
-        raise IncompatibleSetupError(f"star_flux: got {star_flux}, expected a positive number")
+    require_star(jansky, "star_flux")
     return jansky
 
 
