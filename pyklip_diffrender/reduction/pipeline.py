@@ -42,6 +42,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternChoice,
+    PatternLibrary,
     as_request,
     choose_systematics,
     fit_with_pattern,
@@ -65,7 +66,7 @@ from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.simulation import model_for
-from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
 from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
 __all__ = [
@@ -397,6 +398,18 @@ def prepare(
         )
     )
     cut = replace(cut, science=science, references=references)
+    given = options.systematics
+    if isinstance(given, Systematics):
+        for each in science:
+            require_pattern_of(given, each)
+        remark = caveat(given, science[0])
+        if remark:
+            _log.warning("systematics: the pattern %r: %s", given.name, remark)
+    elif isinstance(given, PatternLibrary) and not given.matching(science[0]):
+        _log.warning(
+            "systematics: none of the %d patterns that were given is of other stars, these pixels, "
+            "detector, mask and filter", len(given.patterns)
+        )  # fmt: skip
     if reference is not None:
         is_open = options.systematics == "auto"
         pattern = reference.pattern_for(cut.science[0]) if is_open else None

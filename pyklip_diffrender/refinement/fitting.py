@@ -26,7 +26,7 @@ from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.admission import require_agreement
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.systematics import Systematics, require_pattern_of
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import as_opd_map
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -268,7 +268,7 @@ def refine(
         Starting values by parameter name, for all observations or one by one. "detector_shift"
         is by default that of the star in the observation.
     systematics : Systematics, optional
-        Known flat-field pattern, see `learn_systematics`.
+        Known flat-field pattern of other stars, see `learn_systematics`.
     progress : bool
         Show progress bars.
 
@@ -282,7 +282,8 @@ def refine(
     MissingOPDError
         If `opd` is None.
     IncompatibleSetupError
-        For settings or systematics that do not fit the model and the observations.
+        For settings that do not fit the model and the observations, and for systematics of another
+        filter, mask or detector, of other pixels, or of the star itself.
     ShapeError, UnitError, NonFiniteError, NoValidPixelsError, CorruptFileError
         As their names say.
     RefinementError
@@ -322,6 +323,9 @@ def refine(
         # A system without a Lyot stop has no parameters of one.
         available = (*model.parameters, "flux", "background")
         adapted = replace(adapted, free=tuple(name for name in adapted.free if name in available))
+    if systematics is not None:
+        for each in observations:
+            require_pattern_of(systematics, each)
     wavefront = as_opd_map(opd)
     problems = [
         Problem(model, each, wavefront, starting_values(model, each, begin), systematics)
