@@ -100,6 +100,49 @@ def test_contrasts_refer_to_the_catalogues_star(fit, tmp_path):
     assert (again.catalogue_flux, again.catalogue_error) == (stated, 0.05)
 
 
+def test_a_flux_that_cannot_be_the_stars_is_refused(fit):
+    """A number in another unit, or of another star; before the fit with that flux."""
+    fit, _ = with_header(fit, fits.Header({"INSTRUME": "NIRCAM", "PIXAR_SR": 9.2e-19}))
+    seen = jansky_per_unit(fit.frames[0]) * fit.frames[0].flux
+    # F_nu = F_lambda lambda^2 / c, in W / m2 / Hz and W / m2 / m.
+    flam = seen * 1e-26 * 2.99792458e8 / 4.5e-6**2 * 1e-6
+    magnitude = -2.5 * math.log10(seen / 3631)
+    cases = ((1000 * seen, "mJy"), (1e6 * seen, "uJy"), (flam, "W / (um m2)"), (magnitude, "mag"))
+    for stated, unit in cases:
+        with pytest.raises(IncompatibleSetupError) as raised:
+            with_star_flux(fit, stated, 0.05)
+        message = str(raised.value)
+        assert f"got {stated:.3g} Jy, expected about {seen:.3g} Jy (to 10 %)" in message
+        assert f"{stated:.3g} {unit}" in message
+        assert f"would be {seen:.3g} Jy" in message
+    flat = replace(fit, initial=as_opd_map("flat"))
+    for factor in (3.4, 1 / 3.4, 12.0):
+        with pytest.raises(IncompatibleSetupError) as raised:
+            with_star_flux(fit, factor * seen, 0.05)
+        assert "would be" not in str(raised.value)
+    # From a flat wavefront the star's flux is uncertain by 40 %.
+    with pytest.raises(IncompatibleSetupError, match=r"\(to 40 %\)"):
+        with_star_flux(flat, 4.3 * seen, 0.05)
+
+
+@pytest.mark.parametrize(("factor", "map_"), [(3.2, True), (1 / 3.4, False)])
+def test_a_flux_within_a_factor_of_three_is_taken(fit, factor, map_):
+    """With the error of the fitted one: 10 % with a map, and 40 % without one."""
+    start = fit if map_ else replace(fit, initial=as_opd_map("flat"))
+    short = replace(start, settings=replace(start.settings, max_iterations=1, wavefront=False))
+    seen = jansky_per_unit(fit.frames[0]) * fit.frames[0].flux
+    assert with_star_flux(short, factor * seen, 0.05, held=1e-9).catalogue_flux == factor * seen
+
+
+def test_flux_densities_in_units_and_magnitudes():
+    stated = ("450 mJy", 0.45, 0.45 * u.Jy, "0.45", 9.767 * u.ABmag, "9.767 mag(AB)")
+    for each in stated:
+        assert ReduceOptions(star_flux=each).star_flux == pytest.approx(0.45, rel=1e-3)
+    for each in ("7.2 mag", "bright", math.nan, -1.0, "0 Jy"):
+        with pytest.raises(IncompatibleSetupError, match=r"star_flux: got"):
+            ReduceOptions(star_flux=each)
+
+
 def test_frames_without_calibration_are_refused_before_the_fit(fit):
     bare, observation = with_header(fit, fits.Header({"INSTRUME": "NIRCAM"}))
     with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
