@@ -123,15 +123,39 @@ def test_a_flux_that_cannot_be_the_stars_is_refused(fit):
     # From a flat wavefront the star's flux is uncertain by 40 %.
     with pytest.raises(IncompatibleSetupError, match=r"\(to 40 %\)"):
         with_star_flux(flat, 4.3 * seen, 0.05)
+    # One that the fit did not correct says even less.
+    lost = replace(flat, status=dr.Status.MODEL_MISMATCH)
+    with pytest.raises(IncompatibleSetupError, match=r"\(to 40 %\)"):
+        with_star_flux(lost, 13.0 * seen, 0.05)
 
 
-@pytest.mark.parametrize(("factor", "map_"), [(3.2, True), (1 / 3.4, False)])
-def test_a_flux_within_a_factor_of_three_is_taken(fit, factor, map_):
+@pytest.mark.parametrize(
+    ("factor", "map_", "status"),
+    [(3.2, True, "CONVERGED"), (1 / 4.1, False, "CONVERGED"), (1 / 12, False, "MODEL_MISMATCH")],
+)
+def test_a_flux_within_a_factor_of_three_is_taken(fit, factor, map_, status):
     """With the error of the fitted one: 10 % with a map, and 40 % without one."""
-    start = fit if map_ else replace(fit, initial=as_opd_map("flat"))
+    start = replace(fit, status=dr.Status[status])
+    start = start if map_ else replace(start, initial=as_opd_map("flat"))
     short = replace(start, settings=replace(start.settings, max_iterations=1, wavefront=False))
     seen = jansky_per_unit(fit.frames[0]) * fit.frames[0].flux
     assert with_star_flux(short, factor * seen, 0.05, held=1e-9).catalogue_flux == factor * seen
+
+
+def test_a_reduction_finds_a_mistaken_unit_before_the_wavefront_is_fitted(fit, caplog):
+    header = fits.Header({**fit.frames[0].observation.header, "CORONMSK": "MASKA335R"})
+    sequence = dr.Sequence("A STAR", (with_header(fit, header)[1],))
+    seen = jansky_per_unit(fit.frames[0]) * fit.frames[0].flux
+    caplog.set_level("INFO")
+    for factor, stages in ((1000, []), (5, ["1. wavefront"])):
+        options = ReduceOptions(
+            star_flux=factor * seen, systematics="off", settings=dr.GaussNewton(cycles=6)
+        )
+        with pytest.raises(IncompatibleSetupError, match=r"star_flux: got"):
+            prepare(sequence, fit.initial, options, model=fit.model).run()
+        begun = [each.getMessage() for each in caplog.records if each.name.endswith("progress")]
+        assert [text for text in begun if "wavefront" in text or "search" in text] == stages
+        caplog.clear()
 
 
 def test_flux_densities_in_units_and_magnitudes():

@@ -124,6 +124,7 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
         ((1,), "name", "two\nlines", ["sequence 2: name", "printable"]),
         ((1,), "size", 4, ["sequence 2: size", "8 or more"]),
         ((1,), "threshold", 10**400, ["sequence 2: threshold", "positive"]),
+        ((1,), "systematics", __file__, ["sequence 2: systematics", "test_survey", "patterns"]),
         ((1,), "systematics", "no.fits", ["sequence 2: systematics", "'no.fits'", "references"]),
         ((1,), "injections", {**PLANETS, "separations": [2.0]}, ["sequence 2", "less than 1.3"]),
         ((1,), "code", "import os", ["sequence 2: got the key 'code'", "one of files"]),

@@ -389,13 +389,22 @@ def _sequence(
 
 
 def _options(table: CheckedTable, default: Options) -> Options:
-    def path(choices: tuple[str, ...], value: Any) -> str:
-        return str(value) if value in choices else str(table.existing(value))
+    def pattern(choices: tuple[str, ...], value: Any) -> str:
+        if value in choices:
+            return str(value)
+        # Late, see `_wrong_settings`. Files without patterns are found before any job begins.
+        from pyklip_diffrender.pattern import as_request
+
+        try:
+            as_request(table.existing(value))
+        except DiffrenderError as error:
+            raise ValueError(str(error)) from error
+        return str(table.existing(value))
 
     values: dict[str, Any] = {}
     for name in default.keywords:
         each = OPTIONS[name]
-        convert = partial(path, each.choices) if each.path else each.checked
+        convert = partial(pattern, each.choices) if each.path else each.checked
         values[name] = table.take(name, getattr(default, name), each.expected, convert)
     if values["wide"] and values["disk"]:
         table.complain("", "wide = true and disk = true", "one of them")
