@@ -15,6 +15,7 @@ from benchmarks.calints_files import SIDE, calints
 from pyklip_diffrender import errors
 from pyklip_diffrender.pattern import (
     MeasuredPattern,
+    as_request,
     choose_systematics,
     combine_patterns,
     package_library,
@@ -491,6 +492,31 @@ def test_frames_are_moved_onto_the_pixels_of_a_pattern_that_is_given():
     assert chosen.science[0].first_pixel == PLACE
     with pytest.raises(errors.IncompatibleSetupError, match="is not seen in these frames"):
         choose_systematics([bare], [], model(), COARSE, **arguments)
+
+
+def test_products_in_place_of_other_files_are_named(tmp_path):
+    """The same thing is said wherever they are given."""
+    (roll,) = (frame("TARGET", {**SAME_FLAT, "EXP_TYPE": "NRC_CORON"}),)
+    fit = dr.refine(model(), roll, COARSE, settings=ALIGNED)
+    known = dr.PatternLibrary((measured("A"),))
+    products = {
+        "a fit": fit.write(tmp_path / "fit.fits"),
+        "a search": dr.detect(fit).write(tmp_path)[0],
+        "a flat-field pattern": given().write(tmp_path / "systematics.fits"),
+        "a library of flat-field patterns": known.write(tmp_path / "library.fits"),
+    }
+    for what, path in products.items():
+        words = f"{path.name}: this is no wavefront map, but {what}, a product of pyklip_diffrender"
+        with pytest.raises(errors.CorruptFileError, match=words):
+            dr.read_opd(path)
+        words = f"{path.name}: it is {what}, a product of pyklip_diffrender; expected frames"
+        with pytest.raises(errors.NoValidPixelsError, match=words):
+            dr.Sequence.from_files(path)
+        if "pattern" in what:
+            assert as_request(path) is not None
+            continue
+        with pytest.raises(errors.CorruptFileError, match=f"this is {what}, expected a flat-fie"):
+            as_request(path)
 
 
 def test_patterns_of_several_flat_fields_and_set_ups_are_not_averaged():

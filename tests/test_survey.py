@@ -117,6 +117,7 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
         ((), "combined", {"spectra": []}, ["combined: spectra", "[]"]),
         ((), "combined", {"parallax": 0.1}, ["combined: got the key 'parallax'", "spectra"]),
         ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
+        ((), "injections", {"contrasts": [12.5]}, ["contrasts", "no magnitudes"]),
         ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
         ((0,), "files", "nowhere.fits", ["sequence 1: files", "nowhere.fits", "exist"]),
         ((0,), "opd", 3, ["sequence 1: opd", "3", "map"]),

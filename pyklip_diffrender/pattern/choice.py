@@ -14,8 +14,8 @@ from astropy import units as u
 from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift
 
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.files import open_fits, product_in
 from pyklip_diffrender.io.headers import same_name
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -275,6 +275,12 @@ def as_request(systematics: object) -> PatternRequest:
             if path.is_file():
                 with open_fits(path) as hdus:
                     is_library = "PATVERS" in hdus[0].header
+                    what = product_in(hdus) or "no product of pyklip_diffrender"
+                    if not is_library and ("INITIAL_OPD" in hdus or "PATTERN" not in hdus):
+                        raise CorruptFileError(
+                            f"{path.name}: this is {what}, expected a flat-field pattern, such as "
+                            "a systematics.fits, or a library of them"
+                        )
                 return PatternLibrary.read(path) if is_library else Systematics.read(path)
     raise IncompatibleSetupError(
         f"systematics: got {systematics!r}, expected 'auto', 'references', 'off', a Systematics, a "

@@ -429,14 +429,14 @@ def to_jansky(star_flux: float | str | u.Quantity) -> float:
     Raises `IncompatibleSetupError` for anything that is not a positive flux density.
     """
     try:
-        value = u.Quantity(star_flux, subok=True)  # A Magnitude is no plain Quantity.
+        value = star_flux if isinstance(star_flux, u.Quantity) else u.Quantity(star_flux)
         if value.unit == u.dimensionless_unscaled:
             value = value * u.Jy
         jansky = float(value.to_value(u.Jy))
     except (TypeError, ValueError) as error:  # Units that cannot be converted are TypeErrors.
         raise IncompatibleSetupError(
             f"star_flux: got {star_flux!r}, expected a flux density such as '0.45 Jy' or "
-            "an AB magnitude such as '9.8 mag(AB)'"
+            "an AB magnitude (9.8 * u.ABmag)"
         ) from error
     if not 0 < jansky < np.inf:
         raise IncompatibleSetupError(f"star_flux: got {star_flux}, expected a positive number")
@@ -461,7 +461,7 @@ def require_agreement_of_flux(fit: Refinement, stated: float) -> None:
         if 1 / limit < jansky / seen < limit:
             meant = (
                 f" {stated:.3g} {unit} would be {jansky:.3g} Jy: state the unit, or convert it. "
-                "That of a spectrum (--star-sed) is in its header or the names of its columns."
+                "That of a spectrum is in the header of its file or the names of its columns."
             )
             break
     raise IncompatibleSetupError(

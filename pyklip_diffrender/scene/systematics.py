@@ -82,6 +82,14 @@ def pattern_fields(hdus: fits.HDUList, version: int = 1) -> dict[str, Any]:
     }
 
 
+def _star_from(facts: dict[str, Any]) -> CatalogueStar:
+    """The star that `asdict` has made a dict of, whose tuples JSON keeps as lists."""
+    known: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in facts.items()
+    }
+    return CatalogueStar(**known)
+
+
 # Whether something that was learned from frames is for other frames.
 
 HALF_COVERED = 0.5
@@ -314,14 +322,7 @@ class Systematics:
             provenance={
                 key: json.loads(header[key.upper()]) for key in _PROVENANCE if key.upper() in header
             },
-            catalogue=tuple(
-                CatalogueStar(
-                    tuple(star["names"]),
-                    star["coordinates"] and tuple(star["coordinates"]),
-                    star["pointing"],
-                )
-                for star in json.loads(header.get("CATALOG", "[]"))
-            ),
+            catalogue=tuple(map(_star_from, json.loads(header.get("CATALOG", "[]")))),
         )
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
@@ -358,7 +359,7 @@ class Systematics:
         with open_fits(path) as hdus:
             try:
                 return cls.from_hdus(hdus)
-            except (KeyError, ValueError) as error:
+            except (KeyError, TypeError, ValueError) as error:
                 raise CorruptFileError(
                     f"{Path(path).name}: not a complete systematics file ({error}); expected one "
                     "written by Systematics.write"

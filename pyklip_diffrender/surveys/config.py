@@ -441,7 +441,10 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
 def _injections(table: CheckedTable, default: Injections) -> Injections:
     own = bool(table.content)
     numbers = "a list of positive numbers, such as [1e-5]"
-    contrasts = table.take("contrasts", default.contrasts, numbers, list_of(as_positive))
+    contrasts = table.take(
+        "contrasts", default.contrasts, f"{numbers}, fluxes over the star's and no magnitudes",
+        list_of(only(as_positive, lambda contrast: contrast < 1)),
+    )  # fmt: skip
     separations = table.take("separations", default.separations, numbers, list_of(as_positive))
     angles = table.take(
         "angles", default.angles, "a list of degrees east of north", only(list_of(as_number), bool)
