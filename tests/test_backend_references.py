@@ -265,9 +265,6 @@ def test_a_map_needs_a_folder_and_the_frames_a_date(maps, files, tmp_path):
     ("settings", "call", "message"),
     [
         ({}, {"calibrate_flux": True}, "JWSTData has no flux calibration"),
-        ({"model_options": {"npx": 64}}, {}, "npx: not known to nircam_coronagraph"),
-        ({"systematics": "maybe"}, {}, "'maybe', expected 'auto', 'references'"),
-        ({"max_chi2": -1.0}, {}, "max_chi2: got -1.0"),
     ],
 )
 def test_mistakes_are_found_before_the_fit(settings, call, message, files, tmp_path):

@@ -629,6 +629,15 @@ def test_a_written_configuration_gives_the_same_run(
     assert "--overwrite" in capsys.readouterr().err
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux has a folder that takes no files.")
+def test_a_folder_that_takes_no_files(reducing, reduced, capsys):
+    assert main([*reducing, "-o", "/proc/x"]) == 1
+    shown = capsys.readouterr().err
+    assert "/proc/x cannot be written" in shown
+    assert "room" not in shown
+    assert reduced == []
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

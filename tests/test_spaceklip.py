@@ -327,6 +327,22 @@ def test_a_flux_of_no_filter_is_refused(tmp_path):
             spaceklip.run_obs(database, opd=OPD, star_flux=flux)
 
 
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"fit_pixel": 80}, TypeError, "unexpected keyword argument 'fit_pixel'"),
+        ({"model_options": {"npx": 8}}, IncompatibleSetupError, "npx: not known to nircam_cor"),
+        ({"systematics": "no.fits"}, IncompatibleSetupError, "systematics: got 'no.fits'"),
+        ({"threshold": 0.0}, IncompatibleSetupError, "threshold: got 0.0"),
+    ],
+)
+def test_settings_are_checked_before_the_first_file_is_read(settings, error, message, tmp_path):
+    database = StandIn(tmp_path, {KEY: concatenation(["missing_calints.fits"])})
+    with pytest.raises(error, match=message):
+        spaceklip.run_obs(database, opd=OPD, **settings)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("offline")
 def test_spaceklips_own_subtraction(tmp_path, monkeypatch, real_database):

@@ -259,9 +259,38 @@ def test_a_pattern_is_not_learned_twice_from_a_reference():
 
     assert pattern(origin="library") is not None
     assert pattern(origin="given") is choice.systematics
+    # One that was given and has the star of a reference frame is not of other stars.
+    learned = replace(choice.systematics, provenance={"stars": ["hd-2"]})
+    assert pattern(origin="given", systematics=learned).name == "the rolls themselves"
+    assert learned.name == "the rolls themselves"
     assert pattern(origin="off", systematics=None) is None
     elsewhere = [reference(0, first_pixel=(700, 1600))]
     assert pattern_for_visit(replace(choice, origin="none"), science()[:1], elsewhere) is None
+
+
+def test_frames_of_several_flat_fields_do_not_share_a_pattern():
+    """The pattern is the error of one flat field."""
+
+    def calibrated(frames, *flats):
+        return [
+            replace(each, header=fits.Header({**each.header, "R_FLAT": f"crds://{flat}.fits"}))
+            for each, flat in zip(frames, flats, strict=True)
+        ]
+
+    same, other = (calibrated(science(), "a", flat) for flat in "ab")
+    chosen, without = (
+        choose_systematics(each, (), model(), OPD, settings=SETTINGS) for each in (same, other)
+    )
+    assert (chosen.origin, without.origin) == ("rolls", "none")
+    aligned = replace(SETTINGS, wavefront=False, free=("flux", "background"))
+    for frames, shared in ((same, True), (other, False)):
+        fit = refine(model(), frames, OPD, systematics=chosen.systematics, settings=aligned)
+        shares = [bool((part.common != 0).any()) for part in fit.linear.frames]
+        assert shares == [shared, shared]
+    # Frames of a reference star with the same pixels, but another flat field, do not take part.
+    (star,) = calibrated([reference(0)], "b")
+    assert pattern_for_visit(without, same[:1], [star]) is None
+    assert pattern_for_visit(without, same[:1], calibrated([star], "a")) is not None
 
 
 def test_exposure_sequences():
@@ -403,6 +432,7 @@ def test_the_prior_about_a_reference_star_grows_with_the_days():
         ({"header": {"DETECTOR": "NRCA2"}}, "got the detector NRCA2, expected NRCALONG"),
         ({"name": "HD 2 4"}, "one of the frames that the reference star HD 2 was fitted to"),
         ({"name": "copy.fits", "date": Time("2022-10-03T04:00")}, "copy.fits is one of the frames"),
+        ({"header": {"TARGPROP": "HD-2"}}, "HD 1 1 shows HD 2, the star that the wavefront was"),
     ],
 )
 def test_a_reference_star_of_other_frames_is_refused(changes, message):

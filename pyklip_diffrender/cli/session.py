@@ -281,6 +281,11 @@ class Run:
             )
         if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
             raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
+        if not shutil.disk_usage(folder).total:
+            raise IncompatibleSetupError(
+                f"{output} cannot be written: {folder} is of the system, and takes no files. "
+                "Choose another place"
+            )
         self._output, self._before = output, _files(output)
 
     def require_room(self, folder: Path, size: float) -> None:

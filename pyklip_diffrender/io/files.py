@@ -36,6 +36,7 @@ __all__ = [
     "fits_files",
     "is_fits_name",
     "open_fits",
+    "product_in",
     "read_bytes",
     "read_image",
     "read_text",
@@ -100,6 +101,24 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 def read_text(path: str | os.PathLike[str]) -> str:
     """Text of a file in UTF-8, with or without the byte-order mark that editors on Windows add."""
     return Path(path).read_text(encoding="utf-8-sig")
+
+
+_PRODUCTS = {
+    "INITIAL_OPD": "a fit",
+    "RESIDUAL_SNR": "a search",
+    "PATTERN": "a flat-field pattern",
+}
+"""Extensions by which products of this package are known, whose headers are those of frames."""
+
+
+def product_in(hdus: fits.HDUList) -> str:
+    """Which product of this package an open file is, such as "a fit"; empty if it is none."""
+    header = hdus[0].header
+    if "PATVERS" in header:
+        return "a library of flat-field patterns"
+    names = [hdu.name for hdu in hdus]
+    known = (what for name, what in _PRODUCTS.items() if name in names)
+    return next(known, "an image" if "DRVERS" in header else "")
 
 
 @contextmanager

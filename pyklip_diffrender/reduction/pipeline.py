@@ -42,6 +42,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternChoice,
+    PatternLibrary,
     as_request,
     choose_systematics,
     fit_with_pattern,
@@ -56,6 +57,7 @@ from pyklip_diffrender.refinement import (
     quick_settings,
     refine,
     refine_again,
+    require_agreement_of_flux,
     require_calibrated,
     settings_for,
     to_jansky,
@@ -65,7 +67,7 @@ from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.simulation import model_for
-from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
 from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
 __all__ = [
@@ -397,6 +399,18 @@ def prepare(
         )
     )
     cut = replace(cut, science=science, references=references)
+    given = options.systematics
+    if isinstance(given, Systematics):
+        for each in science:
+            require_pattern_of(given, each)
+        remark = caveat(given, science[0])
+        if remark:
+            _log.warning("systematics: the pattern %r: %s", given.name, remark)
+    elif isinstance(given, PatternLibrary) and not given.matching(science[0]):
+        _log.warning(
+            "systematics: none of the %d patterns that were given is of other stars, these pixels, "
+            "detector, mask and filter", len(given.patterns)
+        )  # fmt: skip
     if reference is not None:
         is_open = options.systematics == "auto"
         pattern = reference.pattern_for(cut.science[0]) if is_open else None
@@ -454,6 +468,7 @@ class _Run:
                 self.preparation.sequence, self.preparation.wavefront, options
             )
         if saved is None:
+            self._require_possible_flux()
             for_pattern = options.references == "pattern" or options.systematics == "references"
             for_pattern = for_pattern or (options.disk and options.references == "joint")
             choice, fit = fit_with_pattern(
@@ -542,25 +557,9 @@ class _Run:
         whole, cut = prepared.whole.science, prepared.sequence.science
         if not any(map(has_bright_pixels_beyond, whole, cut)):
             return ()
-        aligned = replace(
-            prepared.settings or settings_for(cut[0]),
-            wavefront=False,
-            companions=(),
-            max_companions=0,
-            companions_if_stalled=False,
-            max_iterations=_ALIGNING,
-        )
 
         def sources(science: tuple[Observation, ...]) -> tuple[list[Planet], list[Any]]:
-            fit = refine(
-                prepared.model,
-                science,
-                prepared.wavefront,
-                settings=aligned,
-                start=prepared.options.start,
-                progress=self.progress,
-            )
-            return sources_beyond(fit.frames, whole, cut)
+            return sources_beyond(self._aligned(science).frames, whole, cut)
 
         with stage("bright sources beyond the fitted pixels"):
             _, lights = sources(cut)
@@ -578,6 +577,34 @@ class _Run:
                 each.contrast, each.separation,
             )  # fmt: skip
         return tuple(planets)
+
+    def _aligned(self, science: tuple[Observation, ...]) -> Refinement:
+        """Fit place, flux and background of frames with the wavefront of the map."""
+        prepared = self.preparation
+        settings = replace(
+            prepared.settings or settings_for(science[0]),
+            wavefront=False,
+            companions=(),
+            max_companions=0,
+            companions_if_stalled=False,
+            max_iterations=_ALIGNING,
+        )
+        return refine(
+            prepared.model,
+            science,
+            prepared.wavefront,
+            settings=settings,
+            start=prepared.options.start,
+            progress=self.progress,
+        )
+
+    def _require_possible_flux(self) -> None:
+        """Find a flux of the star in a mistaken unit before the wavefront is fitted."""
+        stated = self.preparation.options.star_flux
+        if stated is not None:
+            aligned = self._aligned(self.preparation.sequence.science)
+            if aligned.status.usable:
+                require_agreement_of_flux(aligned, to_jansky(stated))
 
     @staticmethod
     def _has(injections: QTable | None, count: int) -> bool:

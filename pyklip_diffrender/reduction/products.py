@@ -169,7 +169,7 @@ def _pattern(used: Mapping[str, Any] | None) -> str:
     text = " and ".join(filter(None, parts)) or used["name"]
     if used["size"] is not None:
         text += f"; strength in these frames {plus_minus(used['size'], used['size_error'])}"
-    return text
+    return "; ".join(filter(None, (text, used["caveat"])))
 
 
 def _age(days: float | None) -> str:

@@ -28,9 +28,9 @@ from pyklip_diffrender.pattern import (
 )
 from pyklip_diffrender.reduction.visit import slew_drift
 from pyklip_diffrender.refinement import GaussNewton, Refinement, settings_for
-from pyklip_diffrender.scene.exposure import detector_of, image_mask
+from pyklip_diffrender.scene.exposure import CatalogueStar, detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.systematics import Systematics, contradiction, shows_star
 from pyklip_diffrender.wavefront.opd import OPDMap, read_opd
 
 __all__ = ["ReferenceStar", "reference_star_in"]
@@ -173,6 +173,18 @@ class ReferenceStar:
         patterns = self.patterns.matching(observation)
         return combine_patterns(patterns) if len(patterns) > 1 else None
 
+    @property
+    def stars(self) -> tuple[CatalogueStar, ...]:
+        """The star, by every name and by the coordinates that are known."""
+        known = tuple(dict.fromkeys(star for each in self.patterns.patterns for star in each.stars))
+        return known or (CatalogueStar((self.star,)),)
+
+    @property
+    def flat(self) -> str | None:
+        """Flat field with which its frames were calibrated; None if there are several."""
+        flats = {each.flat for each in self.patterns.patterns}
+        return flats.pop() if len(flats) == 1 else None
+
     def has(self, observation: Observation) -> bool:
         """Whether an observation is of one of the exposures that were fitted, by name or date."""
         dates = {each.date for each in self.patterns.patterns if each.date}
@@ -185,21 +197,25 @@ class ReferenceStar:
         Raises
         ------
         IncompatibleSetupError
-            For another filter, mask or detector, and for the frames of this very star.
+            For another filter, mask or detector, and for frames of this very star.
         """
-        own = (self.filter, self.image_mask, self.detector)
-        header, name = observation.header, observation.name
-        other = (observation.filter, image_mask(header, name), detector_of(header, name))
-        for what, here, there in zip(("filter", "mask", "detector"), own, other, strict=True):
-            if None not in (here, there) and here != there:
-                raise IncompatibleSetupError(
-                    f"{name}: got the {what} {there}, expected {here}, that of the reference star "
-                    f"{self.star}"
-                )
+        name, differing = observation.name, contradiction(self, observation)
+        if differing is not None:
+            what, here, there = differing
+            raise IncompatibleSetupError(
+                f"{name}: got the {what} {there}, expected {here}, that of the reference star "
+                f"{self.star}"
+            )
         if self.has(observation):
             raise IncompatibleSetupError(
                 f"{name} is one of the frames that the reference star {self.star} was fitted to, "
                 "expected frames of another star. Give a wavefront map"
+            )
+        if shows_star(self, observation):
+            raise IncompatibleSetupError(
+                f"{name} shows {self.star}, the star that the wavefront was fitted to, expected "
+                "frames of another star: light of its planets may be part of that wavefront. Give "
+                "a wavefront map"
             )
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:

@@ -22,6 +22,7 @@ from pyklip_diffrender.reduction.pages import advice, sentence
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import caveat
 
 __all__ = ["summarise", "wavefronts"]
 
@@ -157,6 +158,7 @@ def _systematics(reduction: ReductionResult) -> dict[str, Any] | None:
         "other_stars": [star for star in provenance["stars"] if star not in fitted],
         "size": size,
         "size_error": error,
+        "caveat": caveat(used, reduction.sequence.science[0]),
     }
 
 

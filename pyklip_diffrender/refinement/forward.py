@@ -30,7 +30,7 @@ from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
-from pyklip_diffrender.scene.exposure import module_of
+from pyklip_diffrender.scene.exposure import flat_field_of, module_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap, resample
@@ -642,8 +642,8 @@ class Objective:
 
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
-        # Which frames show the same pixels of the detector, so that the error of the systematics is
-        # one unknown in all of them. It is noise of every other frame.
+        # Which frames show the same pixels of the detector through the same flat field, so that the
+        # error of the systematics is one unknown in all of them. It is noise of every other frame.
         self.shares_pattern = _sharing([forward.problem for forward in self.forwards])
         self.robust = robust
 
@@ -744,20 +744,21 @@ class Objective:
 
 
 def _sharing(problems: Sequence[Problem]) -> tuple[bool, ...]:
-    """Which frames show the same pixels of the detector with an uncertain pattern.
+    """Which frames show the same pixels with one flat field, whose pattern is uncertain.
 
     Of several such sets the largest shares it, or the first one of two equal ones.
     """
     places = [
-        (each.observation.first_pixel, each.observation.shape, id(each.systematics))
+        (seen.first_pixel, seen.shape, flat_field_of(seen.header, seen.name), id(each.systematics))
         for each in problems
+        for seen in (each.observation,)
     ]
     known = [
         place
         for place, problem in zip(places, problems, strict=True)
         if place[0] is not None and bool((problem.gain_error > 0).any())
     ]
-    # Frames that show the same pixels have the same first pixel, shape and systematics.
+    # Such frames have the same first pixel, shape, flat field and systematics.
     most = max(known, key=known.count, default=None)
     if most is None or known.count(most) < 2:
         return (False,) * len(problems)

@@ -18,7 +18,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.io.files import fits_files, open_fits, unpacked_name
+from pyklip_diffrender.io.files import fits_files, open_fits, product_in, unpacked_name
 from pyklip_diffrender.io.headers import merged_header, same_name, unknown_name
 from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
@@ -203,11 +203,11 @@ def _why_a_product(hdus: fits.HDUList) -> str:
     Only the contents count: products keep cards of the frames, and may have any name.
     """
     first = hdus[0].header
-    what = ""
-    if "SCI" not in hdus and any(_is_map(hdu) for hdu in hdus):
+    product, what = product_in(hdus), ""
+    if product:
+        what = f"{product}, a product of pyklip_diffrender"
+    elif "SCI" not in hdus and any(_is_map(hdu) for hdu in hdus):
         return _MAP
-    if any(key in first for key in ("DRVERS", "PATVERS")):
-        what = "a product of pyklip_diffrender"
     elif any(key in hdu.header for hdu in hdus[:2] for key in ("PYKLIPV", "PSFSUB")):
         what = "an image from which pyKLIP has subtracted the star"
     elif "SCI" not in hdus:

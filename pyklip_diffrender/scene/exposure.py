@@ -34,6 +34,7 @@ __all__ = [
     "bar_place",
     "beginning",
     "detector_of",
+    "flat_field_of",
     "identity_of",
     "image_mask",
     "instrument_of",
@@ -99,6 +100,12 @@ def detector_of(header: fits.Header, name: str) -> str | None:
         return _DETECTORS.get(aperture, aperture)
     match = _NAME.search(Path(name).name)
     return match[9].upper() if match else None
+
+
+def flat_field_of(header: fits.Header, name: str) -> str | None:
+    """Name of the flat field of the calibration (R_FLAT), without its address; None if unstated."""
+    stated = header_text(header, "R_FLAT", name)
+    return None if stated is None else stated.rpartition("/")[2]
 
 
 def identity_of(header: fits.Header, name: str) -> str | None:

@@ -389,13 +389,22 @@ def _sequence(
 
 
 def _options(table: CheckedTable, default: Options) -> Options:
-    def path(choices: tuple[str, ...], value: Any) -> str:
-        return str(value) if value in choices else str(table.existing(value))
+    def pattern(choices: tuple[str, ...], value: Any) -> str:
+        if value in choices:
+            return str(value)
+        # Late, see `_wrong_settings`. Files without patterns are found before any job begins.
+        from pyklip_diffrender.pattern import as_request
+
+        try:
+            as_request(table.existing(value))
+        except DiffrenderError as error:
+            raise ValueError(str(error)) from error
+        return str(table.existing(value))
 
     values: dict[str, Any] = {}
     for name in default.keywords:
         each = OPTIONS[name]
-        convert = partial(path, each.choices) if each.path else each.checked
+        convert = partial(pattern, each.choices) if each.path else each.checked
         values[name] = table.take(name, getattr(default, name), each.expected, convert)
     if values["wide"] and values["disk"]:
         table.complain("", "wide = true and disk = true", "one of them")
@@ -432,7 +441,10 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
 def _injections(table: CheckedTable, default: Injections) -> Injections:
     own = bool(table.content)
     numbers = "a list of positive numbers, such as [1e-5]"
-    contrasts = table.take("contrasts", default.contrasts, numbers, list_of(as_positive))
+    contrasts = table.take(
+        "contrasts", default.contrasts, f"{numbers}, fluxes over the star's and no magnitudes",
+        list_of(only(as_positive, lambda contrast: contrast < 1)),
+    )  # fmt: skip
     separations = table.take("separations", default.separations, numbers, list_of(as_positive))
     angles = table.take(
         "angles", default.angles, "a list of degrees east of north", only(list_of(as_number), bool)
