@@ -28,10 +28,12 @@ from pyklip_diffrender.cli.session import (
     file_type,
     free_memory,
     keep_freed_memory,
+    named_files,
     open_streams,
     option,
     outputs,
     require_frames,
+    require_in_place,
     search,
     together,
     wavefront,
@@ -58,7 +60,7 @@ __all__ = [
 
 # The commands that compute something.
 
-_DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
+_DEMO = ("demo.png", "demo.fits", "demo.ecsv", "candidates.ecsv")
 
 
 @click.command(
@@ -91,7 +93,8 @@ def demo(
 
     Needs no data, half a minute and 2 GB of memory.
     """
-    run.claim_folder(output, _DEMO, overwrite)
+    run.claim_folder(output, _DEMO)
+    products = named_files(output, _DEMO, overwrite)
     from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
     from pyklip_diffrender.drawing import save
 
@@ -103,9 +106,12 @@ def demo(
         progress=run.progress,
         device=run.device,
     )
-    written = write_demo(result, output)
-    figure = output / "demo.png"
-    save(draw_demo(result), figure)
+
+    def write(folder: Path) -> list[Path]:
+        save(draw_demo(result), folder / _DEMO[0])
+        return [folder / _DEMO[0], *write_demo(result, folder)]
+
+    figure, *written = products.replace(write)
     click.echo()
     click.echo("\n".join(result.table.pformat(max_lines=-1, max_width=-1)))
     click.echo(
@@ -126,6 +132,7 @@ def demo(
     if not len(result.detection.candidates):
         click.echo(f"  none above {result.detection.threshold:g} sigma")
     click.echo(f"\nwrote {figure} and {len(written)} more files")
+    require_in_place(products)
 
 
 def _star_callback(
@@ -283,12 +290,14 @@ def psf(
     overwrite: bool,
 ) -> None:
     """Write the image of a star behind the coronagraph."""
-    run.claim_file(output, overwrite)
+    run.claim_file(output)
+    from pyklip_diffrender.io.files import require_new, write_fits
+
+    require_new([output], overwrite)
     import numpy as np
     from astropy.io import fits
 
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.io.files import write_fits
     from pyklip_diffrender.io.headers import fits_text
     from pyklip_diffrender.wavefront.opd import as_opd_map, resample
 
@@ -418,7 +427,8 @@ def learn(
     same command goes on where an earlier one was stopped.
     """
     require_frames(frames, program)
-    run.claim_file(output, overwrite)
+    run.claim_file(output)
+    products = named_files(output.parent, (output.name,), overwrite)
     from pyklip_diffrender.archive import fetch_calints
     from pyklip_diffrender.cli.reducing import map_for
     from pyklip_diffrender.io.files import without_fits_suffix
@@ -442,14 +452,15 @@ def learn(
         device=run.device,
         progress=run.progress,
     )
-    library.write(output, overwrite=overwrite)
+    (path,) = products.replace(lambda folder: [library.write(folder / output.name)])
     table = library.validation
     for name in ("chi2_alone", "chi2_with_others", "shown"):
         table[name].info.format = ".2f"
     click.echo("\n".join(table[list(_COLUMNS)].pformat(max_lines=-1, max_width=-1)))
     if len(library.stars) < 2:
         click.echo("only one star: nothing tests its pattern, and it is not used for that star")
-    click.echo(f"wrote {output}: {len(library.patterns)} frames of {', '.join(library.stars)}")
+    click.echo(f"wrote {path}: {len(library.patterns)} frames of {', '.join(library.stars)}")
+    require_in_place(products)
 
 
 # ``pyklip-diffrender doctor``: whether the package can work here.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 from collections import Counter, abc
 from collections.abc import Callable
@@ -14,7 +15,14 @@ from typing import Any, Literal
 
 import click
 
-from pyklip_diffrender.cli.session import Run, config_remark, free_memory, with_options
+from pyklip_diffrender.cli.session import (
+    Run,
+    config_remark,
+    free_memory,
+    named_files,
+    require_in_place,
+    with_options,
+)
 from pyklip_diffrender.detection import COMBINED, Combination
 from pyklip_diffrender.detection.recovery import TOGETHER
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
@@ -33,9 +41,7 @@ from pyklip_diffrender.reduction import (
     COMPARISON,
     PRODUCTS,
     SPECTRA,
-    UNFINISHED,
     ProductFolder,
-    existing_products,
     in_words,
     prepare,
     search_together,
@@ -184,7 +190,6 @@ def run_reduction(
     figures: Literal["pdf", "png", "svg"] | None,
     json: bool,
     dry_run: bool,
-    resume: bool,
     quick: bool,
     opd: str,
     opd_date: Rule | None,
@@ -200,8 +205,6 @@ def run_reduction(
     """
     if dry_run and json:
         raise click.UsageError("A --dry-run has no summary to print with --json.")
-    if resume and overwrite:
-        raise click.UsageError("--resume keeps products, and --overwrite replaces them.")
     if star_sed is not None and options["star_flux"] is not None:
         raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
     try:
@@ -209,7 +212,14 @@ def run_reduction(
         checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
         raise click.UsageError(with_options(str(error)) + config_remark()) from error
-    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED), overwrite or resume)
+    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
+    # What is there now may be replaced if the user says so, but not what other runs write later.
+    writing: dict[str, Any] = {
+        "derivatives": derivatives, "figures": figures, "overwrite": overwrite,
+    }  # fmt: skip
+    whole = ProductFolder(output, **writing)
+    above = named_files(output, (*COMPARISON, *COMBINED), overwrite)
+    earlier = [whole, *(ProductFolder(each, overwrite=True) for each in _listed(output))]
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
         sequences = read()
@@ -223,10 +233,11 @@ def run_reduction(
                 f"star_flux: got one flux density for {', '.join(filters)}, expected one for each. "
                 "Choose a --filter, or give the star's spectrum with --star-sed"
             )
+        written = [ProductFolder(each, **writing) for each in folders] if several else [whole]
         prepared = []
         for sequence, folder in zip(sequences, folders, strict=True):
             if several:
-                run.claim_folder(folder, tuple(PRODUCTS), overwrite or resume)
+                run.claim_folder(folder, tuple(PRODUCTS))
                 click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
             _show(sequence)
             map_ = map_for(sequence, opd, opd_date)
@@ -241,54 +252,49 @@ def run_reduction(
         if dry_run:
             return
         summaries = {}
-        for preparation, folder in zip(prepared, folders, strict=True):
-            if resume and _is_finished(folder):
-                click.echo(f"{folder}: this reduction has finished")
-            else:
-                products = ProductFolder(
-                    folder,
-                    derivatives=derivatives,
-                    figures=figures,
-                    overwrite=overwrite,
-                    resume=resume,
-                )
-                try:
-                    with numbered_stages(dict(steps_of(preparation.sequence, preparation.options))):
-                        reduction = preparation.run(progress=run.progress, products=products)
-                        with stage("products"):
-                            written = products.finish(reduction)
-                except KeyboardInterrupt:
-                    if (folder / UNFINISHED).exists():
-                        click.echo("to go on, repeat the command with --resume", err=True)
-                    raise
-                click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")
+        for preparation, products in zip(prepared, written, strict=True):
+            with numbered_stages(dict(steps_of(preparation.sequence, preparation.options))):
+                reduction = preparation.run(progress=run.progress, products=products)
+                with stage("products"):
+                    files = products.keep(reduction)
+            folder = products.folder
+            click.echo(f"wrote {folder / 'report.html'} and {len(files) - 1} more files")
             summary = loads(read_text(folder / "summary.json"))
-            summaries[folder.name] = summary
+            summaries[folder] = summary
             status = summary["status"]
             click.echo(f"\n{summary['sentence']}\n{status['name']}: {status['message']}.")
             click.echo(with_options(status["advice"]))
-        if overwrite:
-            _remove_others(output, folders)
+        place = above.place() if several else output
+        above.clear()
+        for each in earlier:
+            if each.asked not in folders:
+                each.clear()
+                if each is not whole and not any(each.asked.iterdir()):
+                    each.asked.rmdir()
         if several:
             first = sequences[0].science[0]
             motion = proper_motion or motion_of(first.header, first.name)
             combination = search_together(
-                folders, spectra=spectra or SPECTRA, star=star_sed, motion=motion, parallax=parallax
+                list(summaries),
+                spectra=spectra or SPECTRA,
+                star=star_sed,
+                motion=motion,
+                parallax=parallax,
             )
             if isinstance(combination, str):
                 combination = with_options(combination)
-            page, data = write_comparison(summaries, motion, output, combination)
+            named = {
+                Path(os.path.relpath(folder, place)).as_posix(): each
+                for folder, each in summaries.items()
+            }
+            page, data = write_comparison(named, motion, place, combination)
             summary = loads(read_text(data))
             if isinstance(combination, Combination):
-                combination.write(output, overwrite=overwrite or resume)
+                combination.write(place)
             click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
     if json:
         click.echo(dumps(summary, indent=2))
-
-
-def _is_finished(folder: Path) -> bool:
-    """Whether a folder has the products of a reduction that was not interrupted."""
-    return (folder / "summary.json").exists() and not (folder / UNFINISHED).exists()
+    require_in_place(*written, above)
 
 
 def _require_spectra(spectra: tuple[str, ...], filters: list[str]) -> None:
@@ -318,22 +324,15 @@ def _names(sequences: abc.Sequence[Sequence]) -> list[str]:
     return [f"{day}_{name}" for day, name in zip(days, filters, strict=True)]
 
 
-def _remove_others(output: Path, folders: list[Path]) -> None:
-    """Remove the products of an earlier run from other folders than those of this one."""
-    earlier = [output]
-    page, data = (output / name for name in COMPARISON)
-    if data.exists():
-        with suppress(ValueError, KeyError, TypeError):
-            listed = loads(read_text(data))["reductions"]
-            # Only names, so that a file that was changed cannot point outside the folder.
-            earlier += [output / Path(each["folder"]).name for each in listed]
-    for folder in set(earlier) - set(folders):
-        for path in existing_products(folder):
-            path.unlink()
-        if folder != output and folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-    for path in (page, data, *(output / name for name in COMBINED)):
-        path.unlink(missing_ok=True)
+def _listed(output: Path) -> list[Path]:
+    """Folders of the epochs and filters of an earlier run."""
+    _, data = (output / name for name in COMPARISON)
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        listed = loads(read_text(data))["reductions"]
+        # Only names, so that a file that was changed cannot point outside the folder.
+        folders = {output / Path(each["folder"]).name for each in listed}
+        return sorted(folder for folder in folders if folder.is_dir())
+    return []
 
 
 def _day(sequence: Sequence) -> str:

@@ -14,13 +14,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.io.files import OutputFolder
 
 __all__ = [
     "COMMON",
@@ -34,11 +37,13 @@ __all__ = [
     "file_type",
     "free_memory",
     "keep_freed_memory",
+    "named_files",
     "open_streams",
     "option",
     "outputs",
     "read_config",
     "require_frames",
+    "require_in_place",
     "search",
     "together",
     "wavefront",
@@ -251,17 +256,17 @@ class Run:
         logging.getLogger().addHandler(handler)
         self._handlers.append(handler)
 
-    def claim_folder(self, folder: Path, products: tuple[str, ...], overwrite: bool) -> None:
-        """Raise IncompatibleSetupError if products cannot be written or would be replaced."""
+    def claim_folder(self, folder: Path, products: tuple[str, ...]) -> None:
+        """Raise IncompatibleSetupError if products cannot be written."""
         _require_no_broken_link(folder, "--output")
         if folder.exists() and not folder.is_dir():
             raise IncompatibleSetupError(f"--output: {folder} is a file, expected a folder")
         for name in products:
             _require_no_broken_link(folder / name, "--output")
-        self._claim(folder, _existing(folder), [folder / name for name in products], overwrite)
+        self._claim(folder, _existing(folder))
 
-    def claim_file(self, path: Path, overwrite: bool) -> None:
-        """Raise IncompatibleSetupError if a file cannot be written or would be replaced."""
+    def claim_file(self, path: Path) -> None:
+        """Raise IncompatibleSetupError if a file cannot be written."""
         _require_no_broken_link(path, "OUTPUT")
         if not path.absolute().parent.is_dir():
             raise IncompatibleSetupError(
@@ -269,16 +274,9 @@ class Run:
             )
         if path.is_dir():
             raise IncompatibleSetupError(f"--output: {path} is a folder, expected a file")
-        self._claim(path, path.absolute().parent, [path], overwrite)
+        self._claim(path, path.absolute().parent)
 
-    def _claim(self, output: Path, folder: Path, products: list[Path], overwrite: bool) -> None:
-        taken = [path for path in products if path.exists()]
-        if taken and not overwrite:
-            verb = "exists" if len(taken) == 1 else "exist"
-            raise IncompatibleSetupError(
-                f"{', '.join(map(str, taken))} {verb}; choose another place, or replace with "
-                "--overwrite"
-            )
+    def _claim(self, output: Path, folder: Path) -> None:
         if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
             raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
         self._output, self._before = output, _files(output)
@@ -300,6 +298,28 @@ class Run:
             return "nothing was written"
         names = sorted(path.name for path, _ in written)
         return f"these files in {output} are new and complete: {', '.join(names)}"
+
+
+def named_files(folder: Path, names: tuple[str, ...], overwrite: bool) -> OutputFolder:
+    """Folder for products of these names; raises ExistingFileError as an `OutputFolder`."""
+    from pyklip_diffrender.io.files import OutputFolder
+
+    return OutputFolder(
+        folder, lambda inside: [inside / name for name in names], overwrite=overwrite
+    )
+
+
+def require_in_place(*outputs: OutputFolder) -> None:
+    """Raise ExistingFileError, at the end of a run, if products are not where they should be."""
+    from pyklip_diffrender.io.files import moved_aside
+
+    elsewhere = [each for each in outputs if each.folder != each.asked]
+    if elsewhere:
+        asked, used = (
+            ", ".join(str(getattr(each, name)) for each in elsewhere)
+            for name in ("asked", "folder")
+        )
+        raise ExistingFileError(moved_aside(asked, used))
 
 
 def _require_no_broken_link(path: Path, option: str) -> None:
@@ -615,9 +635,6 @@ search = _all(
            help="Spectrum or photometry of the star, in place of --star-flux: two columns in "
                 "micron and Jy, a table with units, or a VOTable of VizieR's photometry viewer. "
                 'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
-    option("--resume", is_flag=True, section="Output",
-           help="Go on with a reduction that was interrupted: its fit and search are kept in the "
-                "folder of the products."),
     option("--dry-run", is_flag=True, section="Output",
            help="Make all checks, show frames, wavefront map, steps, time and memory, and stop."),
     option("--derivatives", is_flag=True, section="Output",
