@@ -43,6 +43,7 @@ __all__ = [
     "replacing",
     "require_new",
     "sha256",
+    "stamps",
     "unpacked_name",
     "without_fits_suffix",
     "write_fits",
@@ -299,22 +300,22 @@ class OutputFolder:
         self._products = products
         require_new(products(self.folder), overwrite)
         # The products that may be replaced, as they are now.
-        self._known = _stamps(products(self.folder))
+        self._known = stamps(products(self.folder))
 
     def place(self) -> Path:
         """Return the folder to write to now: a new one if somebody else has written to this one."""
-        found = _stamps(self._products(self.folder))
+        found = stamps(self._products(self.folder))
         if any(self._known.get(path) != stamp for path, stamp in found.items()):
             self.folder, self._known = _new_folder_in(self.asked), {}
         return self.folder
 
     def clear(self, keep: Iterable[Path] = ()) -> None:
         """Remove the products that may be replaced, apart from some to `keep`."""
-        found, kept = _stamps(self._known), set(keep)
+        found, kept = stamps(self._known), set(keep)
         for path, stamp in self._known.items():
             if path not in kept and found.get(path) == stamp:
                 path.unlink()
-        self._known = _stamps(kept)
+        self._known = stamps(kept)
 
     def replace(self, write: Callable[[Path], Iterable[Path]]) -> list[Path]:
         """Put new products in place of the earlier ones, all of them or none.
@@ -353,7 +354,7 @@ def moved_aside(asked: object, used: object) -> str:
     )
 
 
-def _stamps(paths: Iterable[Path]) -> dict[Path, tuple[int, int]]:
+def stamps(paths: Iterable[Path]) -> dict[Path, tuple[int, int]]:
     """Times (ns) and sizes of the files that exist, which tell whether one was replaced."""
     stamps = {}
     for path in paths:
