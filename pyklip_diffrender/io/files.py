@@ -258,7 +258,8 @@ def require_new(paths: Iterable[str | os.PathLike[str]], overwrite: bool) -> Non
     if existing and not overwrite:
         verb = "exists" if len(existing) == 1 else "exist"
         raise ExistingFileError(
-            f"{', '.join(existing)} {verb}; choose another place, or replace with overwrite=True"
+            f"{', '.join(existing)} {verb}; choose another place, or replace with the option "
+            "overwrite"
         )
 
 

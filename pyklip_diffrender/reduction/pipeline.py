@@ -253,7 +253,7 @@ class ReductionResult:
             reason = "The residual is far above the noise, as it is where the star has a disk"
         if not reason:
             return ""
-        return f"{reason}: repeat the reduction with disk=True (--disk on the command line)."
+        return f"{reason}: repeat the reduction with the option disk."
 
     @cached_property
     def extended(self) -> str:
@@ -345,7 +345,7 @@ def prepare(
     elif not wavefront.data.any() and sequence.science[0].is_nircam:
         _log.warning(
             "without a wavefront map the star's flux, and contrasts with it, may be wrong by 40 %; "
-            "give the flux as star_flux (--star-flux)"
+            "give the flux with the option star_flux"
         )
     if options.wide:
         require_outer_pixels(sequence.science[0], options.side)

@@ -647,7 +647,7 @@ class Observation:
             raise NoValidPixelsError(
                 f"{self.name}: no valid pixel within {window.shape[1]} x {window.shape[0]} "
                 "pixels of the star. Check the star centre in the header, or fit more pixels: a "
-                "larger size (--size)"
+                "larger size"
             )
         return part
 
@@ -657,7 +657,7 @@ class Observation:
             x, y = self.center[0]
             raise ShapeError(
                 f"{self.name}: {window.shape[1]} x {window.shape[0]} pixels about the star at x, "
-                f"y = {x:.1f}, {y:.1f} do not fit into {nx} x {ny}. Choose a smaller size (--size)"
+                f"y = {x:.1f}, {y:.1f} do not fit into {nx} x {ny}. Choose a smaller size"
             )
 
     def _cut(self, windows: list[Window]) -> Observation:
