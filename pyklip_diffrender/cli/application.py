@@ -307,8 +307,8 @@ def psf(
     edge = size / 2 * min(model.detector.pixelscale)
     if not np.abs(offset).max() < edge:
         raise IncompatibleSetupError(
-            f"offset: got {offset[0]:g} {offset[1]:g}, expected a star inside the image, less "
-            f"than {edge:.3g} arcsec from its centre along x and y. Choose a larger size"
+            f"--offset: got {offset[0]:g} {offset[1]:g}, expected a star inside the image, less "
+            f"than {edge:.3g} arcsec from its centre along x and y. Choose a larger --size"
         )
     map_ = as_opd_map(opd)
     pixels = model.calc_psf(opd=resample(map_.data, model.npix), star_offset=offset)["DET_SAMP"]

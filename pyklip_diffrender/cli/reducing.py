@@ -218,7 +218,7 @@ def _require_flux_and_spectra(
     filters = list(dict.fromkeys(each.filter or "unknown" for each in sequences))
     if options.star_flux is not None and len(filters) > 1:
         raise IncompatibleSetupError(
-            f"star_flux: got one flux density for {', '.join(filters)}, expected one for each. "
+            f"--star-flux: got one flux density for {', '.join(filters)}, expected one for each. "
             "Choose a --filter, or give the star's spectrum with --star-sed"
         )
     listed = [each for each in spectra if each != "free"]
