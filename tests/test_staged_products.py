@@ -131,6 +131,8 @@ def test_without_overwrite_products_of_another_run_are_kept_as_well(tmp_path):
         # Products of the next stages belong there as well.
         assert run.replace(writing("again")) == files(tmp_path / "out" / f"out-{number}")
     assert {path.read_text() for path in files(tmp_path / "out")} == {"first"}
+    with pytest.raises(IncompatibleSetupError, match=r"a\.txt is a file, expected a folder"):
+        OutputFolder(tmp_path / "out" / "a.txt", files, overwrite=True)
     with pytest.raises(ExistingFileError, match=r"a\.txt, .*b\.txt exist"):
         OutputFolder(tmp_path / "out", files, overwrite=False)
     # What the new products do not have is removed, but not where somebody has changed it.

@@ -492,6 +492,10 @@ def test_a_combined_search_is_kept_until_its_jobs_or_spectra_change(tmp_path, ca
     assert combined(first) == before
     assert page.read_text() == "kept"
     assert caplog.text.count("combined search of") == 1
+    # A damaged one is made again.
+    page.with_name("comparison.json").write_text("{")
+    assert combined(first) == before
+    assert page.read_text() != "kept"
     flat = combined({**first, "combined": {"spectra": ["flat"]}})
     assert [each["name"] for each in flat["spectra"]] == ["flat"]
     assert not flat["free"]

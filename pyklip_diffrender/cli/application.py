@@ -89,8 +89,8 @@ def demo(
 
     Needs no data, half a minute and 2 GB of memory.
     """
-    run.claim_folder(output, _DEMO)
     products = named_files(output, _DEMO, overwrite)
+    run.claim_folder(output, _DEMO)
     from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
     from pyklip_diffrender.drawing import save
 

@@ -92,12 +92,12 @@ def run_reduction(
         checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
         raise click.UsageError(str(error)) from error
-    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
     # What is there now may be replaced if the user says so, but not what other runs write later.
     writing: dict[str, Any] = {
         "derivatives": derivatives, "figures": figures, "overwrite": overwrite,
     }  # fmt: skip
     whole = ProductFolder(output, **writing)
+    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
     above = named_files(output, (*COMPARISON, *COMBINED), overwrite)
     earlier = [whole, *(ProductFolder(each, overwrite=True) for each in _listed(output))]
     # Libraries may print, too.

@@ -209,8 +209,6 @@ class Run:
     def claim_folder(self, folder: Path, products: tuple[str, ...]) -> None:
         """Raise IncompatibleSetupError if products cannot be written."""
         _require_no_broken_link(folder, "--output")
-        if folder.exists() and not folder.is_dir():
-            raise IncompatibleSetupError(f"--output: {folder} is a file, expected a folder")
         for name in products:
             _require_no_broken_link(folder / name, "--output")
         self._claim(folder, _existing(folder))

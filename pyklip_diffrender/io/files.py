@@ -27,6 +27,7 @@ from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
     ExistingFileError,
+    IncompatibleSetupError,
     MissingFileError,
 )
 
@@ -288,6 +289,8 @@ class OutputFolder:
     ------
     ExistingFileError
         If there are products, and `overwrite` is False.
+    IncompatibleSetupError
+        If the folder is a file.
     """
 
     def __init__(
@@ -298,6 +301,8 @@ class OutputFolder:
         overwrite: bool,
     ) -> None:
         self.asked = self.folder = Path(folder)
+        if self.folder.exists() and not self.folder.is_dir():
+            raise IncompatibleSetupError(f"output: {folder} is a file, expected a folder")
         self._products = products
         require_new(products(self.folder), overwrite)
         # The products that may be replaced, as they are now.

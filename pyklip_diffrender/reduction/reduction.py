@@ -150,8 +150,8 @@ def reduce(
     Raises
     ------
     IncompatibleSetupError
-        For options that `ReduceOptions` refuses, and for `star_flux` with frames that are not
-        calibrated.
+        For options that `ReduceOptions` refuses, for `star_flux` with frames that are not
+        calibrated, and if `output` is a file.
     TypeError
         For a keyword that is no option, or keywords together with `options`.
     ExistingFileError
