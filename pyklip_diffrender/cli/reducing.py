@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import replace
 from json import dumps, loads
@@ -128,27 +128,18 @@ def run_reduction(
         for each in earlier:
             if each.asked not in folders:
                 each.clear()
-                if each is not whole and not any(each.asked.iterdir()):
+                if each is not whole and each.asked.is_dir() and not any(each.asked.iterdir()):
                     each.asked.rmdir()
         if several:
             first = sequences[0].science[0]
-            motion = proper_motion or motion_of(first.header, first.name)
-            combination = search_together(
-                list(summaries),
+            summary = _compared(
+                summaries,
+                place,
                 spectra=spectra or SPECTRA,
                 star=star_sed,
-                motion=motion,
+                motion=proper_motion or motion_of(first.header, first.name),
                 parallax=parallax,
             )
-            named = {
-                Path(os.path.relpath(folder, place)).as_posix(): each
-                for folder, each in summaries.items()
-            }
-            page, data = write_comparison(named, motion, place, combination)
-            summary = loads(read_text(data))
-            if isinstance(combination, Combination):
-                combination.write(place)
-            click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
     if json:
         click.echo(dumps(summary, indent=2))
     require_in_place(*written, above)
@@ -180,6 +171,23 @@ def _reduced(preparation: Preparation, products: ProductFolder, *, progress: boo
     click.echo(f"\n{summary['sentence']}\n{status['name']}: {status['message']}.")
     click.echo(status["advice"])
     return summary
+
+
+def _compared(summaries: Mapping[Path, Any], place: Path, **search: Any) -> Any:
+    """Search finished reductions together, and compare them on a page in the folder `place`.
+
+    `summaries` are by the folders of the reductions, and `search` the arguments of
+    `search_together`. Returns the content of ``comparison.json``.
+    """
+    combination = search_together(list(summaries), **search)
+    named = {
+        Path(os.path.relpath(folder, place)).as_posix(): each for folder, each in summaries.items()
+    }
+    page, data = write_comparison(named, search["motion"], place, combination)
+    if isinstance(combination, Combination):
+        combination.write(place)
+    click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
+    return loads(read_text(data))
 
 
 def describe_steps(sequence: Sequence, options: ReduceOptions) -> str:
