@@ -107,6 +107,25 @@ def test_the_pattern_of_one_star_holds_for_the_other(frames, tmp_path):
         np.testing.assert_allclose(one.value, other.value, atol=1e-9)
 
 
+@pytest.mark.parametrize(("card", "value"), [("ROLL_REF", 171.0), ("R_FLAT", "new.fits")])
+def test_frames_whose_header_was_corrected_are_fitted_again(
+    frames, tmp_path, monkeypatch, card, value
+):
+    """The pixels are the same; date, flat field and star of a pattern are those of the header."""
+    (path, *_) = sorted(frames.iterdir())
+    kept = tmp_path / "fits"
+    learned([path], folder=kept)
+    (first,) = kept.iterdir()
+    fits.setval(path, card, value=value, ext=int(card == "ROLL_REF"))
+    learned([path], folder=kept)
+    (last,) = set(kept.iterdir()) - {first}
+    (frame,) = dr.Refinement.read(last).frames
+    assert frame.observation.header[card] == value
+    # With the header as it was corrected, nothing is fitted any more.
+    monkeypatch.setattr("pyklip_diffrender.pattern.learn.refine", None)
+    learned([path], folder=kept)
+
+
 def test_stars_and_filters_that_are_not_there_are_refused(frames):
     with pytest.raises(
         errors.IncompatibleSetupError, match=r"star: got 'HD 7', expected one of 'HD 1'"

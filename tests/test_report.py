@@ -92,7 +92,7 @@ def test_products_of_another_reduction_are_removed(folder):
 def test_no_writer_replaces_a_file_without_being_asked(tmp_path, write, name):
     path = tmp_path / name
     path.write_text("earlier", encoding="utf-8")
-    with pytest.raises(OSError, match=rf"{re.escape(name)} exists.*overwrite=True"):
+    with pytest.raises(OSError, match=rf"{re.escape(name)} exists.*option overwrite"):
         write(reduction(), path)
     assert [each.name for each in tmp_path.iterdir()] == [name]
     assert path.read_text(encoding="utf-8") == "earlier"
@@ -158,7 +158,7 @@ def test_candidates_in_line_suggest_a_disk():
     three = replace(Candidates.at(places, np.full(3, 1e-5)), detection_errors=errors)
     detection = replace(whole.detection, sources=three, false_alarm=np.zeros(3))
     crowded = replace(whole, detection=detection)
-    suggestion = "repeat the reduction with disk=True (--disk on the command line)"
+    suggestion = "repeat the reduction with the option disk"
     assert len(crowded.detection.candidates) == 3
     assert str(crowded).endswith(f"{suggestion}.")
     assert suggestion in crowded._repr_html_()

@@ -11,8 +11,6 @@ from survey_stubs import configuration, inputs
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
-from pyklip_diffrender.cli.application import application
-from pyklip_diffrender.cli.session import read_config as command_config
 from pyklip_diffrender.instrument.spectrum import read_spectrum
 from pyklip_diffrender.io.files import fits_files, is_fits_name
 from pyklip_diffrender.pattern import PatternLibrary, package_library
@@ -140,6 +138,3 @@ def test_configurations_may_begin_with_a_byte_order_mark(tmp_path):
     plain = read_config(path)
     path.write_text(MARK + path.read_text(encoding="utf-8"), encoding="utf-8")
     assert read_config(path) == plain
-    config = tmp_path / "run.toml"
-    config.write_text(f"{MARK}quiet = true\n[psf]\nsize = 20\n", encoding="utf-8")
-    assert command_config(application.commands["psf"], config)["size"] == 20

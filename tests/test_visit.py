@@ -211,7 +211,7 @@ def test_frames_that_do_not_fit_into_the_memory_are_left_out(caplog):
     _, visit, _ = with_references(fit, choice, [reference(0), reference(1)], memory=memory)
     assert [each.use for each in visit.contributions] == ["joint", "left out"]
     assert "memory" in visit.contributions[1].reason
-    assert "--memory" in caplog.text
+    assert "GB of the option memory" in caplog.text
 
 
 @cache

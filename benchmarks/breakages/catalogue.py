@@ -224,8 +224,7 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "atomic", "a product is there whole or not at all",
-            "        yield temporary\n        if path.exists():",
-            "        temporary = path\n        yield temporary\n        if not path.exists():",
+            "        yield temporary\n        _move(temporary, path)", "        yield path",
             "files_units",
         ),
         Breakage(

@@ -26,6 +26,7 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.io.files import fits_files, stamps
 from pyklip_diffrender.options import OPTIONS
 from pyklip_diffrender.wavefront.opd import (
     RULES,
@@ -330,13 +331,12 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
     if isinstance(opd, str | os.PathLike) and opd != FLAT:
         path = Path(opd).resolve()
         # A contrast curve reads the same map for each of its 120 reductions.
-        state = path.stat() if path.is_file() else None
-        opd = _read(path, state and (state.st_mtime_ns, state.st_size))
+        opd = _read(path, tuple(stamps([path]).items()))
     return wavefront_for(opd, date)
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, version: tuple[int, int] | None) -> OPDMap:
+def _read(path: Path, version: tuple[Any, ...]) -> OPDMap:
     """Read a map once for each version of its file."""
     return as_opd_map(path)
 
@@ -350,11 +350,12 @@ def _chosen(folder: str | os.PathLike[str], date: Time | None, rule: Rule) -> OP
             "or give the file of the map as opd"
         )
     path = Path(folder).resolve()
-    version = path.stat().st_mtime_ns if path.is_dir() else 0
-    return _choose_once(path, version, date.isot, rule)
+    # The time of the folder does not say whether one of its files was written again.
+    files = fits_files(path) if path.is_dir() else ()
+    return _choose_once(path, tuple(stamps(files).items()), date.isot, rule)
 
 
 @lru_cache(maxsize=4)
-def _choose_once(folder: Path, version: int, date: str, rule: Rule) -> OPDMap:
-    """Choose a map once for each state of the folder."""
+def _choose_once(folder: Path, version: tuple[Any, ...], date: str, rule: Rule) -> OPDMap:
+    """Choose a map once for each state of the files in the folder."""
     return choose_map(folder, date, rule)

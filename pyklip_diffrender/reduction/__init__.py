@@ -4,7 +4,6 @@ from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.reduction.pipeline import Preparation, ReductionResult, prepare
 from pyklip_diffrender.reduction.products import (
     PRODUCTS,
-    UNFINISHED,
     ProductFolder,
     existing_products,
     write_products,
@@ -28,7 +27,6 @@ __all__ = [
     "COMPARISON",
     "PRODUCTS",
     "SPECTRA",
-    "UNFINISHED",
     "Contribution",
     "Preparation",
     "ProductFolder",

@@ -43,8 +43,6 @@ from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternChoice,
     PatternLibrary,
-    as_request,
-    choose_systematics,
     fit_with_pattern,
     with_known_pattern,
 )
@@ -72,7 +70,6 @@ from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
 __all__ = [
     "MAX_CHI2",
-    "Checkpoint",
     "Keeper",
     "Preparation",
     "ReductionResult",
@@ -258,7 +255,7 @@ class ReductionResult:
             reason = "The residual is far above the noise, as it is where the star has a disk"
         if not reason:
             return ""
-        return f"{reason}: repeat the reduction with disk=True (--disk on the command line)."
+        return f"{reason}: repeat the reduction with the option disk."
 
     @cached_property
     def extended(self) -> str:
@@ -311,39 +308,11 @@ class ReductionResult:
         return f"{head}\n{self.detection._repr_html_()}"
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """Results so far of a reduction that was interrupted and is resumed."""
-
-    # Names of the stages: search, disk, wide, injections, completeness.
-    done: frozenset[str]
-    # Frames of reference stars that were fitted with the target's come after them.
-    fit: Refinement
-    detection: Detection
-    # What the frames of reference stars have contributed.
-    visit: Visit
-    # Of the fits of the target alone.
-    settings: GaussNewton | None
-    # The pattern of the target's own fit.
-    systematics: Systematics | None
-    # Where the pattern comes from, see `PatternChoice`, and the same with the names of its stars.
-    origin: Any
-    pattern: str
-    # Reference stars that could not be fitted, and why.
-    failed: tuple[tuple[str, str], ...]
-    disk: Disk | None
-    injections: QTable | None
-    completeness: QTable | None
-
-
 class Keeper(Protocol):
     """Receiver of the products of a reduction as they come, such as a `ProductFolder`."""
 
-    def begin(self, sequence: Sequence, opd: OPDMap, options: ReduceOptions) -> Checkpoint | None:
-        """Return what an interrupted reduction of the same frames has done; else None."""
-
-    def keep(self, stage_name: str, reduction: ReductionResult, choice: PatternChoice) -> None:
-        """Keep the products so far, after a stage."""
+    def keep(self, reduction: ReductionResult) -> object:
+        """Keep the products so far, before the next stage begins."""
 
 
 # From a sequence of frames to planets: reference stars, pattern, joint fit, search.
@@ -378,7 +347,7 @@ def prepare(
     elif not wavefront.data.any() and sequence.science[0].is_nircam:
         _log.warning(
             "without a wavefront map the star's flux, and contrasts with it, may be wrong by 40 %; "
-            "give the flux as star_flux (--star-flux)"
+            "give the flux with the option star_flux"
         )
     if options.wide:
         require_outer_pixels(sequence.science[0], options.side)
@@ -439,8 +408,7 @@ class Preparation:
     def run(self, *, progress: bool = False, products: Keeper | None = None) -> ReductionResult:
         """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
 
-        `products` gets the products as they come, and may have what an interrupted reduction has
-        done.
+        `products` gets the products as they come.
         """
         with numbered_stages():
             return _Run(self, progress, products).result()
@@ -456,38 +424,25 @@ class _Run:
 
     def result(self) -> ReductionResult:
         options, whole = self.preparation.options, self.preparation.whole.science
-        saved: Checkpoint | None = None
-        detection: Detection | None = None
+        self._require_possible_flux()
+        for_pattern = options.references == "pattern" or options.systematics == "references"
+        for_pattern = for_pattern or (options.disk and options.references == "joint")
+        choice, fit = fit_with_pattern(
+            self.preparation.sequence.science,
+            self.preparation.sequence.references if for_pattern else (),
+            self.preparation.model,
+            self.preparation.wavefront,
+            self._first_fit,
+            systematics=options.systematics,
+            settings=self.preparation.settings,
+            memory=options.memory,
+            progress=self.progress,
+        )
+        fit, visit, detection = self._with_references(fit, choice)
         disk: Disk | None = None
         wide: WideField | None = None
         injections: QTable | None = None
         fractions: QTable | None = None
-        done: frozenset[str] = frozenset()
-        if self.products is not None:
-            saved = self.products.begin(
-                self.preparation.sequence, self.preparation.wavefront, options
-            )
-        if saved is None:
-            self._require_possible_flux()
-            for_pattern = options.references == "pattern" or options.systematics == "references"
-            for_pattern = for_pattern or (options.disk and options.references == "joint")
-            choice, fit = fit_with_pattern(
-                self.preparation.sequence.science,
-                self.preparation.sequence.references if for_pattern else (),
-                self.preparation.model,
-                self.preparation.wavefront,
-                self._first_fit,
-                systematics=options.systematics,
-                settings=self.preparation.settings,
-                memory=options.memory,
-                progress=self.progress,
-            )
-            label = choice.label
-            fit, visit, detection = self._with_references(fit, choice)
-        else:
-            choice, label, done = self._choice(saved), saved.pattern, saved.done
-            fit, visit, detection = saved.fit, saved.visit, saved.detection
-            disk, injections, fractions = saved.disk, saved.injections, saved.completeness
         sequence = replace(self.preparation.sequence, science=choice.science)
 
         def reduction() -> ReductionResult:
@@ -499,7 +454,7 @@ class _Run:
                 choice.references,
                 choice.systematics,
                 choice.failed,
-                label,
+                choice.label,
                 visit,
                 wide,
                 disk,
@@ -508,45 +463,42 @@ class _Run:
                 options.accuracy,
             )
 
-        def keep(name: str) -> None:
-            if self.products is not None and self._has_more_after(name):
-                with stage(f"products after the stage {name}"):
-                    self.products.keep(name, reduction(), choice)
+        def keep() -> None:
+            if self.products is not None:
+                with stage("products so far"):
+                    self.products.keep(reduction())
 
-        if saved is None and (self.products is not None or not options.disk):
+        if self.products is not None or not options.disk:
             with stage("search"):
                 # Where limits with and without the reference stars were compared, it was searched.
                 detection = detection or self._search(fit)
-            keep("search")
-        if options.disk and "disk" not in done:
+        if options.disk:
+            keep()
             with stage("extended light, and wavefront without it"):
                 disk = fit_disk(fit, progress=self.progress)
                 fit = disk.fit
             with stage("search without extended light"):
                 detection = self._search(fit, disk)
-            keep("disk")
         assert detection is not None
         if options.wide:
+            keep()
             with stage("whole frames"):
                 wide = wide_field(detection, whole)
-            cleaned = None if "wide" in done else wide.subtracted(whole, sequence.science)
+            cleaned = wide.subtracted(whole, sequence.science)
             if cleaned is not None:
                 with stage("star and search without the light of sources beyond the fitted pixels"):
                     fit, visit, again = self._with_references(self._fit(cleaned, choice), choice)
                     detection = again or self._search(fit)
                     wide = wide_field(detection, whole)
-            if "wide" not in done:
-                keep("wide")
         has_limits = bool(len(detection.contrast_curve))
-        if options.injections and has_limits and not self._has(injections, options.injections):
+        if options.injections and has_limits:
+            keep()
             with stage(f"{options.injections} injected planets"):
                 injections = self._inject(detection, choice, disk)
-            if injections is not None:
-                keep("injections")
-        if options.completeness and has_limits and fractions is None:
+        if options.completeness and has_limits:
+            keep()
             with stage("completeness"):
                 fractions = completeness(detection, progress=self.progress)
-            keep("completeness")
         self._require_plausible(detection.fits[0])  # It may have been fitted with companions.
         return reduction()
 
@@ -605,43 +557,6 @@ class _Run:
             aligned = self._aligned(self.preparation.sequence.science)
             if aligned.status.usable:
                 require_agreement_of_flux(aligned, to_jansky(stated))
-
-    @staticmethod
-    def _has(injections: QTable | None, count: int) -> bool:
-        return injections is not None and len(injections) == count
-
-    def _has_more_after(self, name: str) -> bool:
-        """Whether the options ask for stages after one."""
-        options = self.preparation.options
-        stages = {
-            "search": True,
-            "disk": options.disk,
-            "wide": options.wide,
-            "injections": bool(options.injections),
-            "completeness": options.completeness,
-        }
-        later = list(stages)[list(stages).index(name) + 1 :]
-        return any(stages[each] for each in later)
-
-    def _choice(self, saved: Checkpoint) -> PatternChoice:
-        """The choice of the pattern of an interrupted reduction, without fits of other stars."""
-        options = self.preparation.options
-        # The pattern of reference stars or of the caller was stored. That of the library is looked
-        # up again, which moves the frames onto its pixels if need be.
-        known = as_request(options.systematics)
-        if saved.origin != "library":
-            known = saved.systematics or "off"
-        choice = choose_systematics(
-            self.preparation.sequence.science,
-            (),
-            self.preparation.model,
-            self.preparation.wavefront,
-            systematics=known,
-            settings=self.preparation.settings,
-            memory=None if options.memory is None else to_bytes(options.memory, "memory"),
-            progress=self.progress,
-        )
-        return replace(choice, settings=saved.settings, failed=saved.failed, origin=saved.origin)
 
     def _first_fit(self, choice: PatternChoice, again: bool) -> Refinement:
         without = ", without the library's flat-field pattern" if again else ""

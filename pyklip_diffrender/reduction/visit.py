@@ -319,7 +319,7 @@ def _that_fit_into(
     nearest = sorted(references, key=days)
     chosen = nearest[: max(0, int(spare))]
     for each in nearest[len(chosen) :]:
-        left_out[each.name] = f"it does not fit into {memory / 1e9:.3g} GB of memory (--memory)"
+        left_out[each.name] = f"it does not fit into {memory / 1e9:.3g} GB of the option memory"
         _log.warning("%s is left out: %s", each.name, left_out[each.name])
     return [each for each in references if any(each is one for one in chosen)]
 

@@ -48,7 +48,7 @@ __all__ = [
 _SENSED = "RESULT_PHASE"
 """Extension of wavefront-sensing files of MAST."""
 
-_MAP = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd (--opd)"
+_MAP = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd"
 
 _USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
 """Levels of frames that are still those of the detector, the best first."""

@@ -180,8 +180,8 @@ def why_no_star(observation: Observation, images: Images) -> str:
 
 
 _INSIST = (
-    "Look at the frames. If the star is behind the mask, give its place in the file as star "
-    "(--star), x and y in pixels from 0"
+    "Look at the frames. If the star is behind the mask, give its place in the file with the "
+    "option star, x and y in pixels from 0"
 )
 
 

@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,10 +121,20 @@ def _search(star: str, group: Group, output: Path, spectra: Sequence[str]) -> St
     final = output / FOLDER / folder_of(star, key)
     names = tuple(str(job) for job, _ in group)
     data = final / COMPARISON[1]
-    if not data.exists():
+    combined: Any = _combined_in(data)
+    if combined is None:
+        shutil.rmtree(final, ignore_errors=True)
         _write(star, group, final, spectra)
-    combined = json.loads(read_text(data))["combined"]
+        combined = json.loads(read_text(data))["combined"]
     return StarSearch(star, final.relative_to(output).as_posix(), names, combined)
+
+
+def _combined_in(data: Path) -> Mapping[str, Any] | None:
+    """What ``comparison.json`` has of a search; None if there is no such file, or a damaged one."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        combined: Mapping[str, Any] = json.loads(read_text(data))["combined"]
+        return combined
+    return None
 
 
 def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None:
