@@ -3,18 +3,28 @@
 import gzip
 import re
 import shutil
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.time import Time
 from scipy.ndimage import gaussian_filter
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints, starlight
-from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.scene.exposure import CatalogueStar, beginning, image_mask
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.pattern import MeasuredPattern
+from pyklip_diffrender.scene.exposure import (
+    CatalogueStar,
+    beginning,
+    common_motion,
+    image_mask,
+    star_of,
+)
 
 FIRST, SECOND, THIRD = (f"jw0118400{k}001_03106_00001_nrcalong_calints.fits" for k in (1, 2, 3))
 
@@ -184,6 +194,94 @@ def test_stars_are_told_apart_by_coordinates_and_signs():
     assert plus.separation(CatalogueStar((), (110.0 + 1e-3 / np.cos(np.deg2rad(20.2)), 20.2))) == (
         pytest.approx(3.6, rel=1e-6)
     )
+
+
+FAST = (3.0, 3.4)
+"""arcsec per year, by which a star goes 103 arcsec from 2000 to the end of 2022."""
+DATED = {"MU_RA": FAST[0], "MU_DEC": FAST[1], "MU_EPOCH": "2000-01-01 00:00:00.0000000"}
+UNDATED = {"MU_RA": 0.0, "MU_DEC": 0.0, "MU_EPOCH": "2000-01-01 00:00:00.0000000"}
+
+
+def place_in(date, dec=20.0):
+    """Cards of the coordinates of the fast star at a date, by astropy."""
+    star = SkyCoord(
+        100 * u.deg, dec * u.deg, pm_ra_cosdec=FAST[0] * u.arcsec / u.yr, distance=10 * u.pc,
+        pm_dec=FAST[1] * u.arcsec / u.yr, obstime=Time("2000-01-01"),
+    )  # fmt: skip
+    there = star.apply_space_motion(Time(date))
+    return {"TARG_RA": float(there.ra.deg), "TARG_DEC": float(there.dec.deg)}
+
+
+@pytest.mark.parametrize(
+    ("names", "cards", "dec"),
+    [
+        (("HD 1", "HD 1"), DATED, 20.0),
+        (("HD 1", "GJ 1"), DATED, 20.0),
+        (("HD 1", "GJ 1"), DATED | {"MU_EPOCH": 2000.0}, 20.0),
+        # Near the pole a proper motion is no change of coordinates at a constant rate.
+        (("HD 1", "GJ 1"), DATED, 89.8),
+        # Of names that agree, the motion that any star may have is enough.
+        (("HD 1", "hd-1"), UNDATED, 20.0),
+        (("HD 1", "HD 1"), {}, 20.0),
+    ],
+    ids=["one name", "two names", "a year", "pole", "zeros", "no cards"],
+)
+def test_a_star_with_coordinates_of_two_epochs_is_one(tmp_path, names, cards, dec):
+    """No card says whether TARG_RA is of the catalogue's epoch or of the exposure."""
+    for k, (name, date) in enumerate(zip(names, ("2000-01-01", "2022-10-03"), strict=True)):
+        place = place_in(date, dec)
+        another(tmp_path, f"{k}.fits", star=name, observation=k + 1, cards=cards | place,
+                roll=70.0 + 10 * k, date=f"2022-10-03T0{k}:00:00")  # fmt: skip
+    sequence = dr.Sequence.from_files(tmp_path)
+    assert uses(sequence) == {"0.fits": "target", "1.fits": "target"}
+
+
+@pytest.mark.parametrize(
+    ("names", "cards", "arcsec"),
+    [
+        (("HD 1", "GJ 1"), UNDATED, 10.0),
+        (("HD 1", "GJ 1"), DATED, 10.0),
+        # A motion of which no star is capable explains nothing.
+        (("HD 1", "GJ 1"), UNDATED | {"MU_RA": 3000.0, "MU_DEC": 3400.0}, 103.0),
+        (("TARGET", "TARGET"), DATED, 3600.0),
+        (("TARGET", "TARGET"), UNDATED, 3600.0),
+    ],
+)
+def test_what_the_motion_does_not_explain_are_two_stars(tmp_path, names, cards, arcsec):
+    for k, name in enumerate(names):
+        place = {"TARG_RA": 100.0, "TARG_DEC": 20.0 + k * arcsec / 3600}
+        another(tmp_path, f"{k}.fits", star=name, observation=k + 1, cards=cards | place)
+    with pytest.raises(IncompatibleSetupError, match=r"target: the files have"):
+        dr.Sequence.from_files(tmp_path)
+
+
+def test_the_pattern_of_a_star_is_not_used_for_it_under_another_name():
+    header = fits.Header({"TARGPROP": "GJ 1", "DATE-BEG": "2022-10-03", **DATED})
+    star = star_of(fits.Header({**header, **place_in("2022-10-03")}), "")
+    own = star_of(fits.Header({**header, "TARGPROP": "HD 1", **place_in("2000-01-01")}), "")
+    pattern = MeasuredPattern("HD 1", np.zeros((9, 9)), np.ones((9, 9)), (4, 4), catalogue=own)
+    assert pattern.shows(star, "GJ 1")
+    other = replace(star, coordinates=(star.coordinates[0], star.coordinates[1] + 10 / 3600))
+    assert not pattern.shows(other, "GJ 1")
+
+
+def test_proper_motions_of_headers_are_compared():
+    def motion(*pairs):
+        cards = [fits.Header({"MU_RA": east, "MU_DEC": north}) for east, north in pairs]
+        return common_motion((header, f"{k}.fits") for k, header in enumerate(cards))
+
+    # Zeros are what a proposal has that says nothing.
+    assert motion((0.0, 0.0)) is None
+    assert motion((0.0, 0.0), (0.28, -0.36)) == (0.28, -0.36)
+    assert motion((0.0, -0.36)) == (0.0, -0.36)
+    assert motion((0.28, -0.36), (0.284, -0.36)) == pytest.approx((0.282, -0.36))
+    with pytest.raises(
+        IncompatibleSetupError, match=r"0\.28, -0\.36 in 1\.fits and 0\.4, -0\.4 in 2"
+    ):
+        motion((0.0, 0.0), (0.28, -0.36), (0.4, -0.4))
+    with pytest.raises(CorruptFileError, match=r"281 and -360, expected .*milliarcseconds"):
+        motion((281.0, -360.0))
+    assert motion((-0.80, 10.36)) == (-0.80, 10.36)  # Barnard's star.
 
 
 @pytest.mark.parametrize(

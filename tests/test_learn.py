@@ -9,6 +9,7 @@ import pytest
 import torch
 from astropy import units as u
 from astropy.io import fits
+from astropy.time import Time
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints
@@ -180,7 +181,10 @@ def test_pedestals_are_brought_together():
 def test_libraries_survive_their_files_and_are_combined(tmp_path):
     unknown = measured("B").variance.copy()
     unknown[3, 4] = np.inf
-    catalogue = replace(measured("A").catalogue, names=("A", "Ä 1"), coordinates=(10.0, 2.0))
+    catalogue = replace(
+        measured("A").catalogue, names=("A", "Ä 1"), coordinates=(10.0, 2.0), motion=(0.3, -0.2),
+        epochs=(2000.5, Time(measured("A").date).jyear),
+    )  # fmt: skip
     first = dr.PatternLibrary((measured("A", catalogue=catalogue), measured("B", variance=unknown)))
     second = dr.PatternLibrary(
         (measured("B", value=np.zeros_like(unknown)), measured("C", light=None))

@@ -17,7 +17,7 @@ import click
 from pyklip_diffrender.cli.session import Run, config_remark, free_memory, with_options
 from pyklip_diffrender.detection import COMBINED, Combination
 from pyklip_diffrender.detection.recovery import TOGETHER
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.instrument.spectrum import star_flux_density
 from pyklip_diffrender.io.files import read_text
@@ -41,7 +41,7 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.scene.exposure import proper_motion as motion_of
+from pyklip_diffrender.scene.exposure import common_motion
 from pyklip_diffrender.scene.sequence import SHORT, Sequence
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
@@ -270,11 +270,15 @@ def run_reduction(
         if overwrite:
             _remove_others(output, folders)
         if several:
-            first = sequences[0].science[0]
-            motion = proper_motion or motion_of(first.header, first.name)
             combination = search_together(
-                folders, spectra=spectra or SPECTRA, star=star_sed, motion=motion, parallax=parallax
-            )
+                folders, spectra=spectra or SPECTRA, star=star_sed, motion=proper_motion,
+                parallax=parallax,
+            )  # fmt: skip
+            frames = [each for sequence in sequences for each in sequence.science]
+            try:
+                motion = proper_motion or common_motion((e.header, e.name) for e in frames)
+            except (CorruptFileError, IncompatibleSetupError):
+                motion = None  # Why is said by the search of several epochs.
             if isinstance(combination, str):
                 combination = with_options(combination)
             page, data = write_comparison(summaries, motion, output, combination)

@@ -66,8 +66,7 @@ from pyklip_diffrender.io.units import (
 )
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.refinement.residual import local_maxima
-from pyklip_diffrender.scene.exposure import proper_motion as motion_of
-from pyklip_diffrender.scene.exposure import star_of
+from pyklip_diffrender.scene.exposure import common_motion, star_of
 
 __all__ = ["combine"]
 
@@ -593,8 +592,7 @@ def _motion(detections: Mapping[str, Detection], proper: Any, parallax: Any, mas
     """Motion of the star, from the arguments or the headers."""
     observations = [each.observation for each in detections.values()]
     if proper is None:
-        known = [motion_of(each.header, each.name) for each in observations]
-        proper = next((each for each in known if each is not None), None)
+        proper = common_motion((each.header, each.name) for each in observations)
     if proper is None:
         raise IncompatibleSetupError(
             "combine: got reductions of several epochs, and no header has the star's proper motion "

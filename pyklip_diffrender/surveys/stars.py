@@ -23,7 +23,7 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.scene.exposure import proper_motion
+from pyklip_diffrender.scene.exposure import common_motion
 from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staging
 
 __all__ = ["FOLDER", "StarSearch", "search_stars"]
@@ -132,9 +132,13 @@ def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None
     final.parent.mkdir(exist_ok=True)
     clean(final.parent)
     detections = [each for _, each in group]
-    motions = [proper_motion(each.observation.header, each.observation.name) for each in detections]
-    motion = next((each for each in motions if each is not None), None)
-    combination = search_together(detections, spectra=spectra, motion=motion)
+    combination = search_together(detections, spectra=spectra)
+    try:
+        motion = common_motion((e.observation.header, e.observation.name) for e in detections)
+    except (CorruptFileError, IncompatibleSetupError):
+        motion = (
+            None  # What is wrong with it is the reason why there is no search of several epochs.
+        )
     _log.info("%s: %s", star, in_words(combination))
     jobs = final.parent.parent / "jobs"
     summaries = {
