@@ -12,10 +12,10 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.time import Time
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import fourier_shift, gaussian_filter
 
 import pyklip_diffrender as dr
-from benchmarks.calints_files import SIDE, calints, starlight
+from benchmarks.calints_files import CENTER, SIDE, calints, starlight
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.pattern import MeasuredPattern
 from pyklip_diffrender.scene.exposure import (
@@ -467,6 +467,61 @@ def test_of_two_frames_that_differ_in_brightness_none_is_right(folder):
     another(folder, SECOND, change=times(SCI=2.5, ERR=2.5))
     with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND} contradict each other"):
         dr.Sequence.from_files(folder)
+
+
+def aligned_with_an_outlier(path, recorded):
+    """Shift a file by Fourier transform, as alignments do, with 1e6 for a NaN in ERR."""
+    shift = np.array([0.37, -0.21])
+    with fits.open(path) as hdus:
+        hdus = fits.HDUList([each.copy() for each in hdus])
+    hdus["ERR"].data[0, 60, 120] = 1e6
+    for name in ("SCI", "ERR"):
+        turned = fourier_shift(np.fft.fft2(hdus[name].data[0].astype(float)), shift[::-1])
+        hdus[name].data = np.fft.ifft2(turned).real[None].astype(np.float32)
+    if recorded:
+        hdus.append(fits.ImageHDU(shift[None], name="IMSHIFTS"))
+    hdus.writeto(path, overwrite=True)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_frame_with_errors_that_ring_is_left_out_and_the_others_go_on(folder, recorded):
+    aligned_with_an_outlier(folder / SECOND, recorded)
+    sequence = dr.Sequence.from_files(folder)
+    assert [each.name for each in sequence.science] == [FIRST]
+    ((name, reason),) = sequence.excluded
+    assert name == SECOND
+    assert re.search(
+        r"no pixel is valid|of the pixels within 2 arcsec of the star are valid", reason
+    )
+    assert "positive" in reason
+    for other in (FIRST, THIRD):
+        (folder / other).unlink()
+    with pytest.raises(NoValidPixelsError, match=f"{SECOND}: .* valid"):
+        dr.Sequence.from_files(folder)
+
+
+def test_a_frame_without_valid_pixels_about_the_star_is_left_out(folder):
+    def change(arrays):
+        rows, columns = np.indices(arrays["DQ"].shape[1:])
+        near = np.hypot(columns - CENTER[0], rows - CENTER[1]) * 0.0624 < 1.2
+        arrays["DQ"][:, near] = 1
+
+    another(folder, change=change)
+    another(folder, "y.fits", date="2022-10-03T14:00:00", observation=9, cards={"CRPIX1": 400.0})
+    sequence = dr.Sequence.from_files(folder)
+    assert as_before(sequence)
+    # 64 % of a circle of 2 arcsec are more than 1.2 arcsec from its middle.
+    assert reasons(sequence)["x.fits"].startswith("64% of the pixels within 2 arcsec of the star")
+    assert "is not in the frame of 180 x 180 pixels" in reasons(sequence)["y.fits"]
+
+
+def test_what_too_few_pixels_leave_open_is_said(tmp_path):
+    small = starlight()[78:105, 75:102]
+    path = calints(tmp_path / "small.fits", light=small, cards={"CRPIX1": 14.0, "CRPIX2": 14.0})
+    (frame,) = dr.Sequence.from_files(path).science
+    assert "1.2 arcsec from the star: whether a star is there" in frame.remarks[0]
+    whole = calints(tmp_path / "whole.fits")
+    assert dr.Sequence.from_files(whole).science[0].remarks == ()
 
 
 def test_a_pixel_that_is_missing_at_the_peak_moves_nothing(shared_data, tmp_path):

@@ -38,6 +38,8 @@ from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.pixel_checks import (
     exclude_contradicting,
     exclude_copies,
+    not_judged,
+    why_few_pixels,
     why_no_star,
     why_odd_unit,
     why_other_brightness,
@@ -137,10 +139,14 @@ def judge_frames(files: Iterable[FrameFile]) -> None:
         observation = each.read()
         if observation is not None:
             each.reason = (
-                why_odd_noise(observation.noise_ratios)
+                why_few_pixels(observation)
+                or why_odd_noise(observation.noise_ratios)
                 or why_odd_unit(observation)
                 or ("" if each.place is not None else why_no_star(observation, images_of_stars))
             )
+            remark = not_judged(observation)
+            if remark:
+                each.observation = replace(observation, remarks=(*observation.remarks, remark))
 
 
 # Sequences: the rolls of a target and the reference stars that go with them.
