@@ -306,7 +306,7 @@ def _read(path: Path) -> tuple[tuple[MeasuredPattern, ...], QTable]:
             count = sum(hdu.name == "PATTERN" for hdu in hdus)
             patterns = tuple(_pattern(hdus, k) for k in range(1, 1 + count))
             table = QTable.read(hdus["VALIDATION"]) if "VALIDATION" in hdus else QTable()
-        except (KeyError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise CorruptFileError(
                 f"{path}: not a complete library of patterns ({error}). Learn it again"
             ) from error

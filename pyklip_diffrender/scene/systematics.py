@@ -197,7 +197,7 @@ class Systematics:
         with open_fits(path) as hdus:
             try:
                 return cls.from_hdus(hdus)
-            except (KeyError, ValueError) as error:
+            except (KeyError, TypeError, ValueError) as error:
                 raise CorruptFileError(
                     f"{Path(path).name}: not a complete systematics file ({error}); expected one "
                     "written by Systematics.write"
