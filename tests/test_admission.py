@@ -3,7 +3,6 @@
 import gzip
 import re
 import shutil
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,13 +16,11 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 import pyklip_diffrender as dr
 from benchmarks.calints_files import CENTER, SIDE, calints, starlight
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.pattern import MeasuredPattern
 from pyklip_diffrender.scene.exposure import (
     CatalogueStar,
     beginning,
     common_motion,
     image_mask,
-    star_of,
 )
 
 FIRST, SECOND, THIRD = (f"jw0118400{k}001_03106_00001_nrcalong_calints.fits" for k in (1, 2, 3))
@@ -254,16 +251,6 @@ def test_what_the_motion_does_not_explain_are_two_stars(tmp_path, names, cards, 
         another(tmp_path, f"{k}.fits", star=name, observation=k + 1, cards=cards | place)
     with pytest.raises(IncompatibleSetupError, match=r"target: the files have"):
         dr.Sequence.from_files(tmp_path)
-
-
-def test_the_pattern_of_a_star_is_not_used_for_it_under_another_name():
-    header = fits.Header({"TARGPROP": "GJ 1", "DATE-BEG": "2022-10-03", **DATED})
-    star = star_of(fits.Header({**header, **place_in("2022-10-03")}), "")
-    own = star_of(fits.Header({**header, "TARGPROP": "HD 1", **place_in("2000-01-01")}), "")
-    pattern = MeasuredPattern("HD 1", np.zeros((9, 9)), np.ones((9, 9)), (4, 4), catalogue=own)
-    assert pattern.shows(star, "GJ 1")
-    other = replace(star, coordinates=(star.coordinates[0], star.coordinates[1] + 10 / 3600))
-    assert not pattern.shows(other, "GJ 1")
 
 
 def test_proper_motions_of_headers_are_compared():

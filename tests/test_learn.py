@@ -161,6 +161,10 @@ def test_a_library_is_searched_by_setup_place_star_and_flat():
     catalogue = replace(measured("A").catalogue, names=("G 80-21",), coordinates=(53.1001, -9.4))
     library = dr.PatternLibrary((measured("G 80-21", catalogue=catalogue), measured("B")))
     assert [each.star for each in library.matching(frame)] == ["B"]
+    # Nor do the coordinates of another epoch make it another star.
+    moved = {"MU_RA": 0.0, "MU_DEC": 4.5, "MU_EPOCH": "2000-01-01", "DATE-BEG": "2022-12-01"}
+    frame = observation(TARGPROP="Target 7", TARG_RA=53.1, TARG_DEC=-9.4 + 103.1 / 3600, **moved)
+    assert [each.star for each in library.matching(frame)] == ["B"]
 
 
 def test_pedestals_are_brought_together():

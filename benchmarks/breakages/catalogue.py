@@ -278,7 +278,8 @@ def _fits() -> list[Breakage]:
         Breakage(
             "own-pattern", "the target's own frames are not in its pattern",
             """
-            and not pattern.shows(star, observation.target)
+            and not (pattern.catalogue.is_same(star) or same_name(pattern.star, observation.target))
+            and not any(same_name(pattern.star, each) for each in star.names)
             """, """
             """,
             "learn",

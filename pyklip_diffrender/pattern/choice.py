@@ -16,6 +16,7 @@ from scipy.ndimage import fourier_shift
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.headers import same_name
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern.library import (
@@ -28,7 +29,6 @@ from pyklip_diffrender.pattern.measure import flat_of, lacks_pattern, measure_pa
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
-from pyklip_diffrender.scene.exposure import star_of
 from pyklip_diffrender.scene.jwst_files import shift_frames, shift_variances
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
@@ -328,11 +328,11 @@ def pattern_for_visit(
     if choice.origin in ("off", "given"):
         return choice.systematics
     if choice.origin == "library":
-        own = {each.target: star_of(each.header, each.name) for each in references}
+        own = {each.target for each in references}
         patterns = [
             pattern
             for pattern in choice.library.patterns
-            if not any(pattern.shows(star, name) for name, star in own.items())
+            if not any(same_name(pattern.star, star) for star in own)
         ]
         known = known_systematics(science[0], library=PatternLibrary(tuple(patterns)))
         if known is not None:

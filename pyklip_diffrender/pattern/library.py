@@ -26,7 +26,7 @@ from pyklip_diffrender.io.files import (
     unpacked_name,
     write_fits,
 )
-from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.io.headers import fits_text, same_name
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pattern.measure import (
@@ -103,7 +103,8 @@ class PatternLibrary:
             if (pattern.filter, pattern.image_mask) == (observation.filter, mask)
             and pattern.detector is not None
             and pattern.detector == detector
-            and not pattern.shows(star, observation.target)
+            and not (pattern.catalogue.is_same(star) or same_name(pattern.star, observation.target))
+            and not any(same_name(pattern.star, each) for each in star.names)
             and _covered(pattern, observation) >= _COVERED
         ]
         # Patterns are errors of one flat field: those of several must not be averaged.
@@ -233,9 +234,9 @@ def known_systematics(
         library = package_library() if library else PatternLibrary()
     known = library.matching(observation)
     patterns = measure_patterns(references, common_pedestal(known) if known else None)
+    fitted = {pattern.star for pattern in patterns}
     if all(pattern.first_pixel is not None for pattern in patterns):
-        fitted = {each.star: each.catalogue for each in patterns}
-        patterns += [p for p in known if not any(p.shows(star, n) for n, star in fitted.items())]
+        patterns += [p for p in known if not any(same_name(p.star, star) for star in fitted)]
     return combine_patterns(patterns) if len(patterns) > 1 else None
 
 
@@ -282,7 +283,7 @@ def _hdus(pattern: MeasuredPattern, number: int) -> list[fits.ImageHDU]:
         header[cards[0]], header[cards[1]] = star.coordinates
     if star.motion is not None:
         header["MU_RA"], header["MU_DEC"] = star.motion
-    if len(star.epochs) > 1:
+    if star.epochs and not star.pointing:
         # The other one is the date of the frame.
         header["MU_EPOCH"] = star.epochs[0]
     header["FRAME"], header["DATE-BEG"] = fits_text(pattern.frame), pattern.date

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import minimize_scalar
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.headers import header_text, same_name
+from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement
 from pyklip_diffrender.scene.exposure import CatalogueStar, detector_of, image_mask, star_of
 from pyklip_diffrender.scene.observation import Observation
@@ -317,12 +317,6 @@ class MeasuredPattern:
     light: Image | None = None
     # Names and place of the star.
     catalogue: CatalogueStar = field(default_factory=CatalogueStar)
-
-    def shows(self, star: CatalogueStar, name: str) -> bool:
-        """Whether it was measured on a star, by place or by one of the star's names."""
-        return self.catalogue.is_same(star) or any(
-            same_name(self.star, each) for each in (name, *star.names)
-        )
 
     def with_pedestal(self, pedestal: float) -> MeasuredPattern:
         """Return the pattern as a fraction of the sum of the star and another pedestal.

@@ -189,7 +189,7 @@ class CatalogueStar:
         """RA and Dec in radians in a year, (2, epochs); `motion` is used where there is no own."""
         east, north = self.motion or motion or (0.0, 0.0)
         rate = np.deg2rad(np.hypot(east, north) / 3600)
-        years = year - np.array(self.epochs or (year,))
+        years = year - np.array(self.epochs or (_OLDEST, year))
         place = np.deg2rad(self.coordinates or (0.0, 0.0))
         moved = offset_by(*place, np.arctan2(east, north), rate * years)
         return np.array([each.radian for each in moved])
@@ -215,7 +215,8 @@ def star_of(header: fits.Header, name: str) -> CatalogueStar:
     motion = _motion(header, name)
     if motion is not None and np.hypot(*motion) > _FASTEST:
         motion = None
-    dates = catalogue_epoch(header, name), beginning(header, name)
+    date, since = beginning(header, name), catalogue_epoch(header, name)
+    epochs = [] if date is None else [float(date.jyear)]
     for keys in _COORDINATES:
         place = [header_number(header, key, name) for key in keys]
         # Files without a target have zeros.
@@ -224,8 +225,11 @@ def star_of(header: fits.Header, name: str) -> CatalogueStar:
             if not -90 <= dec <= 90:
                 raise card_error(name, keys[1], dec, "a declination in degrees")
             pointing = keys != _COORDINATES[0]
-            epochs = tuple(float(each.jyear) for each in dates[pointing:] if each is not None)
-            return CatalogueStar(tuple(filter(None, names)), (ra, dec), pointing, motion, epochs)
+            if not pointing:
+                epochs.insert(0, _OLDEST if since is None else float(since.jyear))
+            return CatalogueStar(
+                tuple(filter(None, names)), (ra, dec), pointing, motion, tuple(epochs)
+            )
     return CatalogueStar(tuple(filter(None, names)), motion=motion)
 
 
