@@ -231,7 +231,11 @@ class Sequence:
         Parameters
         ----------
         files : path or sequence of path
-            Stage-2 files (calints), spaceKLIP's aligned files, or a folder with either.
+            Stage-2 files (calints), spaceKLIP's aligned files, folders of either, patterns such as
+            "frames/*_calints.fits", or association files of the archive (*_asn.json), of which the
+            members of the types science and psf are used, by paths relative to the file. With
+            both, science is the target and psf are references, whatever the headers say. In a
+            folder, association files are not read.
         target : str, optional
             Name of the target (TARGPROP or TARGNAME), in which case, spaces and dashes do not
             matter. Default the star that is not marked as a reference (IS_PSF), if there is just
@@ -260,6 +264,8 @@ class Sequence:
             contradict each other, and nothing says which are right.
         NoValidPixelsError
             If no frame of the target is left.
+        CorruptFileError
+            If members of an association are missing.
         """
         sequences = cls.by_epoch(
             files, target=target, filter=filter, references=references, star=star
