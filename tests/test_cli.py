@@ -280,6 +280,18 @@ def detecting(frames, reducing):
     return ["detect", str(frames / "one_calints.fits"), *reducing[2:]]
 
 
+@pytest.mark.parametrize("name", ["x_asn.json", "o*_calints.fits"])
+def test_frames_by_an_association_or_a_pattern(frames, reducing, capsys, name):
+    members = [{"expname": f"{each}_calints.fits", "exptype": kind}
+               for each, kind in (("one", "science"), ("two", "psf"))]  # fmt: skip
+    content = json.dumps({"asn_type": "coron3", "products": [{"name": "x", "members": members}]})
+    (frames / "x_asn.json").write_text(content, encoding="utf-8")
+    assert main(["reduce", str(frames / name), *reducing[2:], "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"target +HIP-1 .*one_calints", out)
+    assert ("two_calints" in out) == (name == "x_asn.json")
+
+
 def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(tmp_path, reducing, capsys):
     arguments = [*reducing, "--dry-run"]
     assert main(arguments) == 0

@@ -9,6 +9,7 @@ import pytest
 import torch
 from astropy import units as u
 from astropy.io import fits
+from astropy.time import Time
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints
@@ -185,6 +186,10 @@ def test_a_library_is_searched_by_setup_place_star_and_flat():
     catalogue = replace(measured("A").catalogue, names=("G 80-21",), coordinates=(53.1001, -9.4))
     library = dr.PatternLibrary((measured("G 80-21", catalogue=catalogue), measured("B")))
     assert [each.star for each in library.matching(frame)] == ["B"]
+    # Nor do the coordinates of another epoch make it another star.
+    moved = {"MU_RA": 0.0, "MU_DEC": 4.5, "MU_EPOCH": "2000-01-01", "DATE-BEG": "2022-12-01"}
+    frame = observation(TARGPROP="Target 7", TARG_RA=53.1, TARG_DEC=-9.4 + 103.1 / 3600, **moved)
+    assert [each.star for each in library.matching(frame)] == ["B"]
 
 
 def test_pedestals_are_brought_together():
@@ -205,7 +210,10 @@ def test_pedestals_are_brought_together():
 def test_libraries_survive_their_files_and_are_combined(tmp_path):
     unknown = measured("B").variance.copy()
     unknown[3, 4] = np.inf
-    catalogue = replace(measured("A").catalogue, names=("A", "Ä 1"), coordinates=(10.0, 2.0))
+    catalogue = replace(
+        measured("A").catalogue, names=("A", "Ä 1"), coordinates=(10.0, 2.0), motion=(0.3, -0.2),
+        epochs=(2000.5, Time(measured("A").date).jyear),
+    )  # fmt: skip
     first = dr.PatternLibrary((measured("A", catalogue=catalogue), measured("B", variance=unknown)))
     second = dr.PatternLibrary(
         (measured("B", value=np.zeros_like(unknown)), measured("C", light=None))

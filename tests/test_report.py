@@ -29,6 +29,7 @@ from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures,
 from pyklip_diffrender.reduction.pipeline import looks_extended
 from pyklip_diffrender.reduction.products import page
 from pyklip_diffrender.refinement import Status
+from pyklip_diffrender.scene.product_headers import world_coordinates
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)
 ROLL = 30.0
@@ -96,6 +97,22 @@ def test_no_writer_replaces_a_file_without_being_asked(tmp_path, write, name):
         write(reduction(), path)
     assert [each.name for each in tmp_path.iterdir()] == [name]
     assert path.read_text(encoding="utf-8") == "earlier"
+
+
+@pytest.mark.parametrize("value", ["N/A", "half an hour", True, None, 1234.5, 1234])
+def test_a_card_that_is_only_told_does_not_end_a_reduction(value):
+    whole = reduction()
+    (frame,) = whole.sequence.science
+    cards = {"EFFEXPTM": value, "PROGRAM": 1184, "CORONMSK": None, "CRVAL1": 100, "RADESYS": None}
+    odd = replace(frame, header=fits.Header({**frame.header, **cards}))
+    summary = summarise(replace(whole, sequence=replace(whole.sequence, science=(odd,))))
+    known = value if isinstance(value, int | float) and value is not True else None
+    assert summary["exposure_s"] == summary["frames"][0]["exposure_s"] == known
+    assert (summary["program"], summary["image_mask"]) == ("1184", None)
+    json.dumps(summary, allow_nan=False)
+    # A coordinate that is a whole number is one.
+    wcs = world_coordinates(whole.fit.frames[0].grid, odd)
+    assert (wcs["CRVAL1"], wcs["CTYPE1"], wcs["RADESYS"]) == (100.0, "RA---TAN", "ICRS")
 
 
 def test_the_first_sentence_has_the_numbers_of_the_planet():

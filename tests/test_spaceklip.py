@@ -153,6 +153,28 @@ def test_products_have_spaceklips_keywords_and_curves(tmp_path):
     assert again["ALIGN_SHIFT"][0] == "[[0.0, 0.0]]"
 
 
+def test_columns_that_hold_no_value_end_nothing_after_the_fit(tmp_path):
+    """SpaceKLIP copies cards as they are: None, text in place of a number, or masked."""
+    path = frame(tmp_path / "a_calints.fits", np.ones((SIDE, SIDE)), 63.0)
+    with fits.open(path, mode="update") as hdus:
+        del hdus["SCI"].header["CRVAL1"]
+    odd = {"TARG_RA": None, "CWAVEL": "N/A", "EXPSTART": None, "NINTS": "two", "PIXSCALE": "",
+           "EFFINTTM": True, "MASKFILE": None, "BUNIT": b"MJy/sr", "TARGPROP": "β Pic"}  # fmt: skip
+    table = concatenation([path], **odd)
+    table["DWAVEL"] = np.ma.masked_array([1.0], mask=[True])
+    table.remove_column("APERNAME")
+    product = tmp_path / "x-KLmodes-all.fits"
+    fits.writeto(product, np.zeros((1, SIDE, SIDE)), fits.Header({"PSFCENTX": 20, "PSFCENTY": 20}))
+    database_files.complete_header(product, table, "ADI")
+    database_files.write_database(tmp_path / "x.dat", table)
+    database_files.write_mask(tmp_path / "x_psfmask.fits", table)
+    header = fits.getheader(product)
+    assert (header["CWAVEL"], header["TARGPROP"], header["NINTS"]) == ("N/A", "? Pic", 0)
+    assert not {"TARG_RA", "DWAVEL", "EXPSTART", "APERNAME", "CRVAL2"} & set(header)
+    assert not (tmp_path / "x_psfmask.fits").exists()
+    assert Table.read(tmp_path / "x.dat", format="ascii")["CWAVEL"][0] == "N/A"
+
+
 def test_a_failure_is_reported_after_the_others(tmp_path, monkeypatch, caplog):
     good, bad = (concatenation([str(calints(tmp_path / f"{each}_calints.fits"))]) for each in "ab")
     obs = {

@@ -12,9 +12,8 @@ from astropy.time import Time
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import sources_of_references
 from pyklip_diffrender.detection.error_factor import structures_in_single_roll
-from pyklip_diffrender.errors import CorruptFileError, ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.pattern import choose_systematics, pattern_for_visit
-from pyklip_diffrender.reduction import ReduceOptions, Visit, pipeline
+from pyklip_diffrender.reduction import Visit
 from pyklip_diffrender.reduction import visit as visits
 from pyklip_diffrender.reduction.visit import with_references
 from pyklip_diffrender.refinement import GaussNewton, align_frame, join_frames, refine
@@ -348,96 +347,3 @@ def test_a_single_roll_may_show_a_structure_of_the_detector():
     assert row["false_alarm_probability"] < 0.1 * structures
     assert "2 candidates in 12 real rolls" in single.remark
     assert both.remark == ""
-
-
-@cache
-def fitted_reference():
-    """The fit of three dithers of the reference star, from the map."""
-    frames = [replace(reference(k), reference=False) for k in range(3)]
-    choice = choose_systematics(frames, (), model(), OPD, settings=SETTINGS)
-    fit = refine(model(), frames, OPD, systematics=choice.systematics, settings=SETTINGS)
-    return dr.ReferenceStar.of(fit)
-
-
-def sequence(*references):
-    return dr.Sequence("HD 1", science(), references)
-
-
-def test_the_file_of_a_reference_star_is_a_map_and_a_library_of_patterns(tmp_path):
-    star = fitted_reference()
-    path = star.write(tmp_path / "reference.fits")
-    again = dr.ReferenceStar.read(path)
-    np.testing.assert_array_equal(again.wavefront.data, star.wavefront.data)
-    np.testing.assert_array_equal(dr.read_opd(path).data, star.wavefront.data)
-    assert again.wavefront.date == star.wavefront.date == reference(0).date
-    assert len(dr.PatternLibrary.read(path).patterns) == 3
-    for name in ("filter", "image_mask", "detector", "frames", "status", "start"):
-        assert getattr(again, name) == getattr(star, name)
-    assert again.star == star.star == "HD 2"
-    with pytest.raises(ExistingFileError):
-        star.write(path)
-    fits.writeto(tmp_path / "opd.fits", OPD.data, fits.Header({"BUNIT": "m"}))
-    with pytest.raises(CorruptFileError, match="no reference star in it"):
-        dr.ReferenceStar.read(tmp_path / "opd.fits")
-
-
-@pytest.mark.slow
-def test_a_reference_star_in_place_of_a_map_makes_limits_deeper():
-    star = fitted_reference()
-    begun = pipeline.prepare(sequence(reference(0), reference(4)), star, ReduceOptions(size=SIZE))
-    assert begun.wavefront is star.wavefront
-    # A frame that the star was fitted to is not used again.
-    assert [each.name for each in begun.sequence.references] == ["HD 2 8"]
-    pattern = begun.options.systematics
-    assert isinstance(pattern, dr.Systematics)
-    assert pattern.provenance["frames"] == list(star.frames)
-    settings = replace(SETTINGS, prior=replace(SETTINGS.prior, scales=begun.settings.prior.scales))
-    fit = refine(model(), science(), star.wavefront, systematics=pattern, settings=settings)
-    assert limit(fit) < limit(alone()[1]) / 1.05
-    candidate_of(dr.detect(fit))
-
-
-def test_settings_about_a_reference_star_are_those_of_the_options():
-    star = fitted_reference()
-    usual, begun = (
-        pipeline.prepare(sequence(), each, ReduceOptions(size=SIZE, accuracy="quick"))
-        for each in (OPD, star)
-    )
-    assert begun.settings.prior.scales["segment"] < 2
-    assert begun.settings.cycles == usual.settings.cycles
-    assert begun.settings.tolerance == usual.settings.tolerance
-    # Settings that are given are not changed; the pattern is used with them as well.
-    own = pipeline.prepare(sequence(), star, ReduceOptions(size=SIZE, settings=SETTINGS))
-    assert own.settings is SETTINGS
-    assert isinstance(own.options.systematics, dr.Systematics)
-
-
-def test_the_prior_about_a_reference_star_grows_with_the_days():
-    star = fitted_reference()
-    usual = GaussNewton.nircam("F444W").prior.scales["segment"]
-    dates = [star.wavefront.date + days * u.day for days in (0.1, 1.0, 5.0, 30.0)]
-    later = [star.settings_for(replace(science()[0], date=date)) for date in dates]
-    scales = [each.prior.scales["segment"] for each in later]
-    assert scales == sorted(scales)
-    # 2.7 nm within hours, and 9 nm after 3.6 days.
-    assert scales[2] / scales[0] == pytest.approx((2.7 + 5 * 1.75) / (2.7 + 0.1 * 1.75))
-    assert scales[-1] == usual
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"filter": "F356W"}, "got the filter F356W, expected F444W"),
-        ({"header": {"CORONMSK": "MASKA430R"}}, "got the mask MASK430R, expected MASK335R"),
-        ({"header": {"DETECTOR": "NRCA2"}}, "got the detector NRCA2, expected NRCALONG"),
-        ({"name": "HD 2 4"}, "one of the frames that the reference star HD 2 was fitted to"),
-        ({"name": "copy.fits", "date": Time("2022-10-03T04:00")}, "copy.fits is one of the frames"),
-        ({"header": {"TARGPROP": "HD-2"}}, "HD 1 1 shows HD 2, the star that the wavefront was"),
-    ],
-)
-def test_a_reference_star_of_other_frames_is_refused(changes, message):
-    first, second = science()
-    header = fits.Header({**first.header, **changes.get("header", {})})
-    other = replace(sequence(), science=(replace(first, **{**changes, "header": header}), second))
-    with pytest.raises(IncompatibleSetupError, match=message):
-        pipeline.prepare(other, fitted_reference(), ReduceOptions(size=SIZE))

@@ -217,6 +217,19 @@ def _frames_and_files() -> list[Breakage]:
             "sequence admission",
         ),
         Breakage(
+            "star-epochs", "coordinates of one star are compared at one epoch",
+            "years = year - np.array(self.epochs or (_OLDEST, year))",
+            "years = 0 * np.array(self.epochs or (_OLDEST, year))", "admission",
+        ),
+        Breakage(
+            "few-pixels", "frames without valid pixels about the star are left out",
+            "if share >= _VALID:", "if share >= 0:", "admission",
+        ),
+        Breakage(
+            "asn-roles", "associations say which frames are the target's",
+            "return known.pop() if len(known) == 1 else None", "return None", "associations",
+        ),
+        Breakage(
             "wcs", "east is left of north in the WCS of products",
             "steps = np.array([[-cosine, sine], [sine, cosine]]) @ steps / 3600",
             "steps = np.array([[cosine, sine], [-sine, cosine]]) @ steps / 3600",
@@ -358,7 +371,7 @@ def _around() -> list[Breakage]:
         ),
         Breakage(
             "job-content", "a survey notices frames whose content changed",
-            '"frames": sorted(inputs[str(path)] for path in files)',
+            '"frames": sorted(inputs[str(path)] for path in frames)',
             '"frames": sorted(map(str, files))', "survey",
         ),
         Breakage(

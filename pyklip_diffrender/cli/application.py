@@ -193,9 +193,10 @@ def reduce_frames(
 ) -> None:
     """Subtract the star from all rolls of a target and search for planets.
 
-    FRAMES are calints files, or one folder of them. With --program they come from MAST. Filters,
-    and epochs more than 5 days apart, are reduced one by one, into a folder for each, then searched
-    together, and compared on one page.
+    FRAMES are calints files, folders of them, patterns ("frames/*_calints.fits") or association
+    files (*_asn.json). With --program they come from MAST. Filters, and epochs more than 5 days
+    apart, are reduced one by one, into a folder for each, then searched together, and compared on
+    one page.
     """
     require_frames(frames, program)
 
@@ -416,8 +417,9 @@ def learn(
 ) -> None:
     """Learn the flat-field pattern from the frames of many stars.
 
-    FRAMES are calints files, or folders of them, of stars without bright companions or disks; with
-    --program they come from MAST. Every star is fitted alone, and again with the pattern of the
+    FRAMES are calints files, folders of them, patterns ("frames/*_calints.fits") or association
+    files (*_asn.json), of stars without bright companions or disks; with --program they come from
+    MAST. Every star is fitted alone, and again with the pattern of the
     others, which tells how much a pattern is worth for a star that it was not learned from. The
     same command goes on where an earlier one was stopped.
     """

@@ -69,8 +69,7 @@ from pyklip_diffrender.instrument.spectrum import PlanetSpectra, planet_spectra,
 from pyklip_diffrender.io.units import half_circle, require_positive, to_arcsec
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.refinement.residual import local_maxima
-from pyklip_diffrender.scene.exposure import proper_motion as motion_of
-from pyklip_diffrender.scene.exposure import star_of
+from pyklip_diffrender.scene.exposure import common_motion, star_of
 
 Spectra = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
@@ -79,9 +78,6 @@ _MOST_MOTIONS = 300
 
 _DIFFERENT = 20.0
 """Chi-squared of two degrees of freedom (5e-5) of two places at one epoch that are two sources."""
-
-_SAME_PROPER_MOTION = 0.01
-"""arcsec per year by which catalogues differ on the proper motion of one star."""
 
 _WITH_STAR, _ON_SKY = "all epochs, with the star", "all epochs, on the sky"
 """Names of the searches in which all epochs are added."""
@@ -886,22 +882,13 @@ def _motion(
     """Motion of the star, from the arguments or the headers."""
     observations = [each.observation for each in detections.values()]
     if proper is None:
-        known = [motion_of(each.header, each.name) for each in observations]
-        values = np.array([each for each in known if each is not None]).reshape(-1, 2)
-        if not len(values):
-            raise IncompatibleSetupError(
-                "combine: got reductions of several epochs, and no header has the star's proper "
-                "motion (MU_RA, MU_DEC). Give proper_motion= (--proper-motion), or combine the "
-                "reductions of each epoch alone"
-            )
-        if float(np.ptp(values, axis=0).max()) > _SAME_PROPER_MOTION:
-            stated = "; ".join(f"{east:g}, {north:g}" for east, north in values)
-            raise IncompatibleSetupError(
-                f"combine: the headers disagree on the star's proper motion (MU_RA, MU_DEC: "
-                f"{stated} arcsec per year). Give proper_motion= (--proper-motion)"
-            )
-        east, north = values.mean(axis=0).tolist()
-        proper = (east, north)
+        proper = common_motion((each.header, each.name) for each in observations)
+    if proper is None:
+        raise IncompatibleSetupError(
+            "combine: got reductions of several epochs, and no header has the star's proper motion "
+            "(MU_RA, MU_DEC). Give proper_motion= (--proper-motion), or combine the reductions of "
+            "each epoch alone"
+        )
     stars = [star_of(each.header, each.name).coordinates for each in observations]
     coordinates = next((each for each in stars if each is not None), None)
     return Motion(proper, parallax, coordinates, mass)

@@ -293,6 +293,11 @@ def _hdus(pattern: MeasuredPattern, number: int) -> list[fits.ImageHDU]:
     if star.coordinates is not None:
         cards = ("RA_REF", "DEC_REF") if star.pointing else ("TARG_RA", "TARG_DEC")
         header[cards[0]], header[cards[1]] = star.coordinates
+    if star.motion is not None:
+        header["MU_RA"], header["MU_DEC"] = star.motion
+    if star.epochs and not star.pointing:
+        # The other one is the date of the frame.
+        header["MU_EPOCH"] = star.epochs[0]
     header["FRAME"], header["DATE-BEG"] = fits_text(pattern.frame), pattern.date
     if pattern.light is not None:
         hdus.append(fits.ImageHDU(pattern.light.astype(np.float32), name="STAR", ver=number))
@@ -312,7 +317,7 @@ def _read(path: Path) -> tuple[tuple[MeasuredPattern, ...], QTable]:
             count = sum(hdu.name == "PATTERN" for hdu in hdus)
             patterns = tuple(_pattern(hdus, k) for k in range(1, 1 + count))
             table = QTable.read(hdus["VALIDATION"]) if "VALIDATION" in hdus else QTable()
-        except (KeyError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise CorruptFileError(
                 f"{path}: not a complete library of patterns ({error}). Learn it again"
             ) from error

@@ -10,7 +10,6 @@ from pyklip_diffrender.reduction.products import (
     write_report,
 )
 from pyklip_diffrender.reduction.reduction import Reduction, reduce
-from pyklip_diffrender.reduction.reference_star import ReferenceStar
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
     SPECTRA,
@@ -33,7 +32,6 @@ __all__ = [
     "ReduceOptions",
     "Reduction",
     "ReductionResult",
-    "ReferenceStar",
     "Visit",
     "by_star",
     "combined_rows",

@@ -44,9 +44,7 @@ from pyklip_diffrender.pattern import (
     PatternChoice,
     PatternLibrary,
     fit_with_pattern,
-    with_known_pattern,
 )
-from pyklip_diffrender.reduction.reference_star import reference_star_in
 from pyklip_diffrender.reduction.visit import Joined, Visit, rough_settings, with_references
 from pyklip_diffrender.refinement import (
     GaussNewton,
@@ -333,13 +331,6 @@ def prepare(
     must be inside the frames. With a model, as many pixels as its detector has are fitted; those
     beyond the edges of the frames are masked. Raises as `reduce`.
     """
-    reference = reference_star_in(opd)
-    if reference is not None:
-        for each in sequence.science:
-            reference.require_setup_of(each)
-        # What its frames say is in the prior already.
-        others = tuple(each for each in sequence.references if not reference.has(each))
-        sequence, opd = replace(sequence, references=others), reference.wavefront
     wavefront = wavefront_for(opd, sequence.date)
     if options.star_flux is not None:
         for each in sequence.science:
@@ -380,14 +371,6 @@ def prepare(
             "systematics: none of the %d patterns that were given is of other stars, these pixels, "
             "detector, mask and filter", len(given.patterns)
         )  # fmt: skip
-    if reference is not None:
-        is_open = options.systematics == "auto"
-        pattern = reference.pattern_for(cut.science[0]) if is_open else None
-        if options.settings is None:  # Whoever gives settings has chosen the prior.
-            settings = reference.settings_for(cut.science[0], settings)
-            settings = settings if pattern is None else with_known_pattern(settings)
-        if pattern is not None:
-            options = replace(options, systematics=pattern)
     return Preparation(sequence, cut, model, wavefront, options, settings)
 
 

@@ -26,7 +26,6 @@ from pyklip_diffrender.reduction.pages import (
 )
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.pipeline import ReductionResult
-from pyklip_diffrender.reduction.reference_star import ReferenceStar
 from pyklip_diffrender.reduction.summary import summarise
 
 __all__ = [
@@ -219,7 +218,6 @@ PRODUCTS = {
     "completeness.ecsv": "fraction of planets that the search finds, by contrast and separation",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the flat-field pattern, for other reductions",
-    "reference.fits": "wavefront and pattern, for fits of other stars of the visit",
 }
 """Every file that a reduction may write, with its content."""
 
@@ -275,9 +273,6 @@ def write_products(
         written.append(reduction.disk.write(folder, overwrite=True))
     if reduction.systematics is not None:
         written.append(reduction.systematics.write(folder / "systematics.fits", overwrite=True))
-    if reduction.fit.status.usable:
-        reference = ReferenceStar.of(reduction.fit)
-        written.append(reference.write(folder / "reference.fits", overwrite=True))
     tables = {"injections": reduction.injections, "completeness": reduction.completeness}
     for name, table in tables.items():
         if table is not None:

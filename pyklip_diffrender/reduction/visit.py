@@ -53,13 +53,12 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["Contribution", "Visit", "rough_settings", "slew_drift", "with_references"]
+__all__ = ["Contribution", "Visit", "rough_settings", "with_references"]
 
 _log = logging.getLogger(__name__)
 
 _SLEWS = WavefrontPrior(scales={"segment": 0.75, "texture": 0.5}, knee=1.0, slope=1.0)
 _DITHERS = WavefrontPrior(scales={"segment": 0.4, "texture": 0.25}, knee=1.0, slope=1.0)
-_SLEW_RMS = 2.7
 _CYCLES = 8.0
 """Drift of the wavefront, nm, between exposures with a slew between them and between the dithers of
 one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show it, from a fourth
@@ -176,12 +175,6 @@ class Joined(NamedTuple):
     fit: Refinement  # the target's frames come first
     visit: Visit
     detection: Detection | None = None  # its search, if there was one
-
-
-def slew_drift(further: float = 0.0) -> WavefrontPrior:
-    """Prior of the drift from one star to the next, `further` nm rms beyond that within hours."""
-    growth = 1 + further / _SLEW_RMS
-    return replace(_SLEWS, scales={name: growth * scale for name, scale in _SLEWS.scales.items()})
 
 
 def rough_settings(settings: GaussNewton) -> GaussNewton:

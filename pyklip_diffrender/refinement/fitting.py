@@ -19,6 +19,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.instrument.spectrum import require_star
+from pyklip_diffrender.io.headers import known_number
 from pyklip_diffrender.io.units import unit_of
 from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -393,10 +394,10 @@ _BRIGHTNESS = u.MJy / u.sr
 
 def _pixel_area(observation: Observation) -> float | None:
     """Solid angle of a pixel, sr, in the photometric calibration; None without calibration."""
-    area = observation.header.get("PIXAR_SR")
+    area = known_number(observation.header, "PIXAR_SR")
     if not (observation.is_nircam and observation.unit.is_equivalent(_BRIGHTNESS)):
         return None
-    return area if isinstance(area, float) and area > 0 else None
+    return area if area is not None and area > 0 else None
 
 
 def require_calibrated(observation: Observation) -> None:

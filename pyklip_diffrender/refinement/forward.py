@@ -17,6 +17,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
 from pyklip_diffrender.instrument.masks import mask_of_header
+from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.io.units import ARCSEC, to_number
 from pyklip_diffrender.linear.model import Noise
 from pyklip_diffrender.linear.response import (
@@ -189,12 +190,12 @@ def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
     Settings that are unknown on either side, such as those of a system that is not an instrument,
     are not compared. Raises `IncompatibleSetupError`.
     """
-    setup, header = model.setup, observation.header
+    setup, header, name = model.setup, observation.header, observation.name
     setups = (
         ("filter", setup.get("filter"), observation.filter),
-        ("image mask", setup.get("image_mask"), header.get("CORONMSK")),
-        ("pupil mask", setup.get("pupil_mask"), header.get("PUPIL")),
-        ("module", setup.get("module"), module_of(header, observation.name)),
+        ("image mask", setup.get("image_mask"), header_text(header, "CORONMSK", name)),
+        ("pupil mask", setup.get("pupil_mask"), header_text(header, "PUPIL", name)),
+        ("module", setup.get("module"), module_of(header, name)),
     )
     for aspect, expected, actual in setups:
         if not isinstance(expected, str) or not isinstance(actual, str):

@@ -24,8 +24,8 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.files import read_image
-from pyklip_diffrender.io.headers import header_number, header_text, merged_header
-from pyklip_diffrender.io.units import native_float64, require_finite
+from pyklip_diffrender.io.headers import card_error, header_number, header_text, merged_header
+from pyklip_diffrender.io.units import ARCSEC, native_float64, require_finite
 from pyklip_diffrender.scene.exposure import (
     bar_place,
     beginning,
@@ -522,6 +522,9 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
             f"{name}: PIXAR_A2 is {area}, expected a pixel area in arcsec^2, such as 0.0039. "
             "Correct the header, or fetch the file again"
         )
+    solid, by_area = number("PIXAR_SR", 0.0), area * ARCSEC**2
+    if solid and not 0.9 < solid / by_area < 1.1:
+        raise card_error(name, "PIXAR_SR", solid, f"about {by_area:.3g} sr, by PIXAR_A2")
     detector = detector_of(header, name) or ""
     if detector.startswith("NRC"):
         usual = _SCALES[detector.endswith(("LONG", "5"))]

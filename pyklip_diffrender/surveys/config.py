@@ -16,6 +16,7 @@ from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, Incompat
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.units import full_circle
 from pyklip_diffrender.options import OPTIONS, SharedOptions
+from pyklip_diffrender.scene.associations import matches
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
 __all__ = [
@@ -99,6 +100,11 @@ class CheckedTable:
         if not exists:
             raise ValueError(str(path))
         return path.absolute()
+
+    def matching(self, value: Any) -> list[Path]:
+        """Paths of a pattern, or the one that exists, relative to the configuration's folder."""
+        found = matches(self.folder / as_text(value))
+        return [self.existing(str(path.absolute())) for path in found]
 
     def finish(self) -> None:
         """Complain about keys that nobody took."""
@@ -238,7 +244,7 @@ class SequenceConfig:
     is_named : bool
         Whether the configuration has given the name. Tables have target and filter otherwise.
     files : tuple of Path
-        Files, or one folder.
+        Files, association files and folders.
     opd : Path
         A wavefront map, or a folder of maps, of which the nearest in time is used; ``Path("flat")``
         for a flat wavefront.
@@ -352,15 +358,15 @@ def _config(top: CheckedTable) -> Config:
 def _sequence(
     table: CheckedTable, options: Options, injections: Injections
 ) -> SequenceConfig | None:
-    expected = "FITS files, or one folder of them, that exist; paths are relative to the folder of "
-    expected += "the configuration"
+    expected = "FITS files, folders of them, patterns such as frames/*_calints.fits or association "
+    expected += "files that exist; paths are relative to the folder of the configuration"
 
     def paths(value: Any) -> tuple[Path, ...]:
         several = value if isinstance(value, list) else [value]
-        existing = tuple(table.existing(each) for each in several)
-        if not existing or (len(existing) > 1 and any(each.is_dir() for each in existing)):
+        found = tuple(path for each in several for path in table.matching(each))
+        if not found:
             raise ValueError
-        return existing
+        return found
 
     missing: list[Any] = [key for key in ("files", "opd") if key not in table.content]
     for key in missing:

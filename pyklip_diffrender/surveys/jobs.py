@@ -21,6 +21,7 @@ from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, Incompat
 from pyklip_diffrender.io.files import fits_files, read_text, sha256
 from pyklip_diffrender.io.headers import file_name
 from pyklip_diffrender.io.units import to_bytes
+from pyklip_diffrender.scene.associations import listed_files
 from pyklip_diffrender.scene.sequence import epochs_of_files
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
 from pyklip_diffrender.wavefront.opd import wavefront_for
@@ -193,7 +194,10 @@ def _job(
     pattern = str(options.systematics)
     known = [] if pattern in ("auto", "references", "off") else _files((Path(pattern),))
     maps = [] if str(opd) == FLAT else [opd]
-    inputs = {str(path): digest(path) for path in (*files, *maps, *known)}
+    # Members of associations are inputs as well.
+    members = [each.path for each in listed_files(files) if not each.reason]
+    frames = dict.fromkeys((*files, *members))
+    inputs = {str(path): digest(path) for path in (*frames, *maps, *known)}
     chosen = {
         name: value
         for name, value in vars(options).items()
@@ -209,7 +213,7 @@ def _job(
     facts = {
         **chosen,
         "version": __version__,
-        "frames": sorted(inputs[str(path)] for path in files),
+        "frames": sorted(inputs[str(path)] for path in frames),
         "opd": inputs.get(str(opd), FLAT),
         "target": sequence.target,
         "filter": sequence.filter,
@@ -247,13 +251,14 @@ def hash_of(facts: Mapping[str, Any]) -> str:
 
 
 def _files(paths: tuple[Path, ...]) -> list[Path]:
-    """Files of a folder, or the files themselves."""
-    if len(paths) > 1 or not paths[0].is_dir():
-        return list(paths)
-    inside = fits_files(paths[0])
-    if not inside:
-        raise CorruptFileError(f"{paths[0]}: the folder has no FITS files")
-    return inside
+    """The files themselves, and those of folders."""
+    files: list[Path] = []
+    for path in paths:
+        inside = fits_files(path) if path.is_dir() else [path]
+        if not inside:
+            raise CorruptFileError(f"{path}: the folder has no FITS files")
+        files += inside
+    return files
 
 
 # Folders of finished jobs: there whole or not at all, whoever is killed when.

@@ -257,7 +257,7 @@ def load_wss_opd(
             "the file again"
         )
     npix = npix or finest_pupil()
-    aperture = header.get("APERNAME", "")
+    aperture = header_text(header, "APERNAME", path.name) or ""
     pupil = pupil_samples(npix, required=backout_si_wfe is True)
     opd = _interpolated(_gaps_filled(coarse), npix) * TO_METRES[unit.strip().lower()]
     history = [
