@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from astropy import units as u
 
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.refinement import GaussNewton, refine
 from pyklip_diffrender.scene import (
     ALPHA_PICTORIS_W2,
     UNOCCULTED_PEAK,
@@ -93,6 +95,27 @@ def test_a_planet_appears_where_it_was_put(model, opd, angle):
     assert float((image * y)[core].sum() / total) == pytest.approx(expected_y, abs=0.35)
     brightest = np.unravel_index(image.argmax(), image.shape)
     assert np.hypot(*np.subtract(brightest, (expected_y, expected_x))) < 1.0
+
+
+def test_planets_whose_copies_would_be_in_the_field_are_refused(model, opd):
+    """Such as those whose separation is in mas. One at a whole period appears on the star."""
+    # lambda / D of the sampled pupil, 6.6 m, times the number of samples.
+    period = NPIX * WAVELENGTH / model.diameter * 206264.8
+    near, copied = (
+        planet_photons(model, Scene(), Planet(1.0, separation, 90.0), opd)
+        for separation in (0.4, period - 0.4)
+    )
+    # The copy is on the other side of the star, behind the same mask.
+    assert copied.sum() > 0.5 * near.sum()
+    for separation in (period - 0.4, 500.0):
+        scene = Scene(planets=(Planet(1e-3, separation, 90.0),))
+        with pytest.raises(IncompatibleSetupError, match=r"scene: got a planet at .* 500 \* u.mas"):
+            simulate(model, scene, opd, seed=1)
+        settings = GaussNewton(cycles=6, companions=scene.planets)
+        frame = simulate(model, Scene(), opd, seed=1)
+        with pytest.raises(IncompatibleSetupError, match=r"companions: got a planet at"):
+            refine(model, frame, opd, settings=settings)
+    simulate(model, Scene(planets=(Planet(1e-3, period - 1.5, 90.0),)), opd, seed=1)
 
 
 def test_a_scene_is_the_sum_of_its_parts(model, opd):

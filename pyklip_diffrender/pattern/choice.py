@@ -25,11 +25,11 @@ from pyklip_diffrender.pattern.library import (
     known_systematics,
     package_library,
 )
-from pyklip_diffrender.pattern.measure import lacks_pattern, measure_patterns
+from pyklip_diffrender.pattern.measure import flat_of, lacks_pattern, measure_patterns
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
-from pyklip_diffrender.scene.exposure import detector_of, flat_field_of, image_mask
+from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.jwst_files import shift_frames, shift_variances
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics, shows_star
@@ -229,11 +229,11 @@ class PatternChoice:
         """
         if self.origin == "library":
             known = {each.flat for each in self.library.matching(self.science[0])}
-            return next((e for e in self.science if None in known or known != {_flat(e)}), None)
+            return next((e for e in self.science if None in known or known != {flat_of(e)}), None)
         if self.origin == "given" and self.systematics is not None:
             stated = {self.systematics.flat, None}
             if len(stated) > 1:
-                return next((each for each in self.science if _flat(each) not in stated), None)
+                return next((each for each in self.science if flat_of(each) not in stated), None)
         return None
 
     def is_refuted_by(self, fit: Refinement) -> bool:
@@ -245,7 +245,7 @@ class PatternChoice:
             return False
         if self.origin == "given":
             assert self.systematics is not None
-            own = sorted({_flat(each) or "not stated" for each in self.science})
+            own = sorted({flat_of(each) or "not stated" for each in self.science})
             raise IncompatibleSetupError(
                 f"systematics: {fit.frames[0].observation.name} shows less than half of the "
                 f"pattern {self.systematics.name!r}. Flat field of the frames: {', '.join(own)}; "
@@ -253,11 +253,6 @@ class PatternChoice:
                 "frames that were calibrated alike, or 'auto'"
             )
         return self.origin == "library"
-
-
-def _flat(observation: Observation) -> str | None:
-    """Name of the flat field of the calibration."""
-    return flat_field_of(observation.header, observation.name)
 
 
 def as_request(systematics: object) -> PatternRequest:
@@ -425,17 +420,17 @@ def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
         filter=first.filter,
         image_mask=image_mask(first.header, first.name),
         detector=detector_of(first.header, first.name),
-        flat=_flat(first),
+        flat=flat_of(first),
         name="the rolls themselves",
     )
 
 
 def _alike(one: Observation, other: Observation) -> bool:
     """Whether two frames have the same pixels and the same error of the flat field."""
-    return (one.first_pixel, one.shape, _flat(one)) == (
+    return (one.first_pixel, one.shape, flat_of(one)) == (
         other.first_pixel,
         other.shape,
-        _flat(other),
+        flat_of(other),
     )
 
 

@@ -28,6 +28,7 @@ from pyklip_diffrender.io.headers import same_name, unknown_name
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.pattern.library import PatternLibrary, known_systematics
 from pyklip_diffrender.pattern.measure import (
+    flat_of,
     measure_patterns,
     pattern_pedestal,
     pattern_size,
@@ -44,7 +45,7 @@ from pyklip_diffrender.scene.admission import (
     frames_by_star,
     require_some,
 )
-from pyklip_diffrender.scene.exposure import detector_of, flat_field_of, image_mask
+from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
 from pyklip_diffrender.scene.sequence import judge_frames
@@ -174,13 +175,8 @@ class _Epoch:
     def setup(self) -> tuple[str | None, ...]:
         """Detector, mask, filter and flat field, whose frames share a pattern."""
         first = self.science[0]
-        header, name = first.header, first.name
-        return (
-            detector_of(header, name),
-            image_mask(header, name),
-            first.filter,
-            flat_field_of(header, name),
-        )
+        mask = image_mask(first.header, first.name)
+        return (detector_of(first.header, first.name), mask, first.filter, flat_of(first))
 
     @property
     def date(self) -> str:

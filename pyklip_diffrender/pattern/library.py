@@ -33,10 +33,11 @@ from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
     common_pedestal,
+    flat_of,
     measure_patterns,
 )
 from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.scene.exposure import flat_field_of, star_of
+from pyklip_diffrender.scene.exposure import star_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import (
     HALF_COVERED,
@@ -248,7 +249,7 @@ def _flat_for(patterns: Sequence[MeasuredPattern], observation: Observation) -> 
     Patterns are errors of one flat field: those of several must not be averaged.
     """
     flats = Counter(pattern.flat for pattern in patterns)
-    own = flat_field_of(observation.header, observation.name)
+    own = flat_of(observation)
     return own if own in flats else max(flats, key=lambda each: flats[each], default=None)
 
 

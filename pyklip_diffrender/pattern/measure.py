@@ -23,6 +23,7 @@ from pyklip_diffrender.scene.exposure import (
     image_mask,
     star_of,
 )
+from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "MeasuredPattern",
     "combine_patterns",
     "common_pedestal",
+    "flat_of",
     "lacks_pattern",
     "learn_systematics",
     "light_and_residual",
@@ -484,6 +486,11 @@ def common_pedestal(patterns: Sequence[MeasuredPattern]) -> float:
     return float(np.median(fixed or [pattern.pedestal for pattern in patterns]))
 
 
+def flat_of(observation: Observation) -> str | None:
+    """Name of the flat field with which frames were calibrated (R_FLAT), without its address."""
+    return flat_field_of(observation.header, observation.name)
+
+
 def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
     observation = frame.observation
     light, left, error, valid = light_and_residual(frame)
@@ -503,7 +510,7 @@ def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
         date="" if observation.date is None else observation.date.isot,
         pedestal=pedestal,
         detector=detector_of(observation.header, observation.name),
-        flat=flat_field_of(observation.header, observation.name),
+        flat=flat_of(observation),
         light=light,
         catalogue=star_of(observation.header, observation.name),
     )

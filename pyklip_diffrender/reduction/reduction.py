@@ -150,8 +150,10 @@ def reduce(
     Raises
     ------
     IncompatibleSetupError
-        For options that `ReduceOptions` refuses, for `star_flux` with frames that are not
-        calibrated, and if `output` is a file.
+        For options that `ReduceOptions` refuses; for `star_flux` with frames that are not
+        calibrated, or that differs from the fitted flux by more than a factor of three; for
+        `systematics` of the star itself, of another filter, mask or detector, of other pixels, or
+        of which the frames show less than half; and if `output` is a file.
     TypeError
         For a keyword that is no option, or keywords together with `options`.
     ExistingFileError

@@ -30,6 +30,7 @@ from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.admission import require_agreement
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.simulation import require_imaged
 from pyklip_diffrender.scene.systematics import Systematics, require_pattern_of
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import as_opd_map
@@ -328,6 +329,7 @@ def refine(
         # A system without a Lyot stop has no parameters of one.
         available = (*model.parameters, "flux", "background")
         adapted = replace(adapted, free=tuple(name for name in adapted.free if name in available))
+    require_imaged(model, adapted.companions, "companions")
     if systematics is not None:
         for each in observations:
             require_pattern_of(systematics, each)

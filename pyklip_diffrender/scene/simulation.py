@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any
 
@@ -14,6 +15,7 @@ from pyklip_diffrender.instrument.masks import MASKS, detector_place, stop_is_me
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.headers import header_text
+from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask, module_of
@@ -26,6 +28,7 @@ __all__ = [
     "images_of_stars",
     "model_for",
     "planet_photons",
+    "require_imaged",
     "simulate",
     "star_photons",
 ]
@@ -182,6 +185,24 @@ _cached_model = lru_cache(maxsize=4)(_model)
 # Simulated observations: the model's image of a scene, with shot and read noise.
 
 
+def require_imaged(model: OpticalSystem, planets: Iterable[Planet], name: str) -> None:
+    """Raise IncompatibleSetupError for planets so far away that they would appear elsewhere.
+
+    The image of a pupil of samples repeats, and what is farther than the field from its next copy
+    would be in the field.
+    """
+    (ny, nx), (x, y) = model.detector.shape, model.detector.pixelscale
+    period = model.npix * min(model.bandpass.wavelengths) / model.diameter / ARCSEC
+    reach = period - max(nx * x, ny * y) / 2
+    for each in planets:
+        if max(np.abs(each.offset)) > reach:
+            raise IncompatibleSetupError(
+                f"{name}: got a planet at {each.separation:.4g} arcsec, expected less than "
+                f"{reach:.3g} arcsec along x and y, beyond which the image of {model.npix} pupil "
+                "samples repeats. Separations are in arcsec, or have a unit, such as 500 * u.mas"
+            )
+
+
 def star_photons(model: OpticalSystem, scene: Scene, opd: Any) -> NDArray[np.float64]:
     """Expected photons of the star alone, (ny, nx)."""
     with torch.no_grad():
@@ -236,6 +257,7 @@ def simulate(
     >>> dr.simulate(model, dr.Scene(), dr.random_opd(1, npix=128), seed=1)
     <Observation 'simulation(seed=1)': 1 frame of 24 x 24 pixels, F444W, ph, no date>
     """
+    require_imaged(model, scene.planets, "scene")
     expected = expected_photons(model, scene, opd)
     generator = np.random.default_rng(seed)
     counts = generator.poisson(expected, size=(frames, *expected.shape)).astype(np.float64)
