@@ -220,10 +220,10 @@ class SharedOptions:
         "meaning": "S/N of a candidate.", "help": "S/N of a candidate.", "metavar": "S/N",
     })  # fmt: skip
     wide: bool = field(default=False, metadata={
-        "meaning": """Search the whole frames as well, see `wide_field`. If sources beyond the
-            fitted pixels are bright enough to be seen in these, the star is fitted once more
-            without their light.""",
-        "help": "Search the whole frames as well, to their edge.",
+        "meaning": """Search the whole frames as well, see `wide_field`: of frames of the whole
+            detector, the field of the mask, 20 arcsec wide. If sources beyond the fitted pixels are
+            bright enough to be seen in these, the star is fitted once more without their light.""",
+        "help": "Search the whole frames as well, to their edge or that of the mask's field.",
     })  # fmt: skip
     disk: bool = field(default=False, metadata={
         "meaning": """Fit extended light about the star, see `fit_disk`, and search the frames

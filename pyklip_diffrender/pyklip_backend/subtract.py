@@ -81,13 +81,16 @@ def subtract_by_refinement(
     tell(f"{_described(fit)}, {fit.seconds:.0f} s, flat-field pattern: {reduction.pattern}")
     tell(f"{counted(number, 'companion')} detected")
     warn_of_status(science[0].name, fit)
-    windows, _ = sequence.windows(model.detector.shape)
     cut = preparation.sequence.science
     fitted = tuple(
         FittedPointing(
-            fit, k, group, window, fit.frames[k].observation.center[0] - cut[k].center[0]
+            fit,
+            k,
+            group,
+            _window(group.observation, each),
+            fit.frames[k].observation.center[0] - each.center[0],
         )
-        for k, (group, window) in enumerate(zip(groups, windows, strict=True))
+        for k, (group, each) in enumerate(zip(groups, cut, strict=True))
     )
     star = np.full(observation.data.shape, np.nan)
     for part in fitted:
@@ -106,6 +109,12 @@ def subtract_by_refinement(
         reduction,
         number if kept else len(fit.companions),
     )
+
+
+def _window(whole: Observation, cut: Observation) -> Window:
+    """The pixels of a frame that a cutout of it has."""
+    x, y = np.rint(whole.center[0] - cut.center[0]).astype(int).tolist()
+    return Window(y, x, cut.shape)
 
 
 def _give_back(

@@ -64,7 +64,7 @@ from pyklip_diffrender.refinement import (
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.scene.simulation import model_for
+from pyklip_diffrender.scene.simulation import model_for, within_field
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
@@ -378,12 +378,13 @@ def prepare(
             "without a wavefront map the star's flux, and contrasts with it, may be wrong by 40 %; "
             "give the flux as star_flux (--star-flux)"
         )
+    sequence = _within_field(sequence)
     if options.wide:
         require_outer_pixels(sequence.science[0], options.side)
     first, settings, coarser = sequence.science[0], options.settings, {}
     if options.accuracy == "quick":
         settings = quick_settings(first.cutout(options.side))
-        coarser = coarse_arguments(first, max(first.shape) if options.wide else options.side)
+        coarser = coarse_arguments(first, (options.side, options.side))
     if model is None:
         model = model_for(first, options.side, device=options.device, **coarser)
         cut = sequence.cutout(options.side)
@@ -406,6 +407,20 @@ def prepare(
         if pattern is not None:
             options = replace(options, systematics=pattern)
     return Preparation(sequence, cut, model, wavefront, options, settings)
+
+
+def _within_field(sequence: Sequence) -> Sequence:
+    """The frames without the pixels beyond the field of their mask, as those of a subarray are."""
+    largest = sequence.science[0].shape
+    science, references = (
+        tuple(map(within_field, frames)) for frames in (sequence.science, sequence.references)
+    )
+    if science[0].shape != largest:
+        _log.info(
+            "frames of %d x %d pixels: of each, the %d x %d about the star are used, the field of "
+            "its mask", *largest[::-1], *science[0].shape[::-1]
+        )  # fmt: skip
+    return replace(sequence, science=science, references=references)
 
 
 @dataclass(frozen=True, eq=False)
