@@ -209,10 +209,11 @@ class SharedOptions:
     })  # fmt: skip
     references: References = field(default="joint", metadata={
         "choices": get_args(References),
-        "meaning": """Use of the frames of reference stars. With "joint" they are fitted together
-            with the target's, in one likelihood, if that makes the limits deeper; with "pattern"
-            they teach the flat-field pattern where the library has none; with "off" they are not
-            used. With `disk`, "joint" stands for "pattern".""",
+        "meaning": """Use of the frames of reference stars. With "joint" those of the target's epoch
+            are fitted together with the target's, in one likelihood, if that makes the limits
+            deeper, and those of other epochs teach the flat-field pattern where the library has
+            none; with "pattern" all of them do; with "off" they are not used. With `disk`, "joint"
+            stands for "pattern".""",
         "help": """Use of the frames of reference stars: in one likelihood with the target's, for
             the flat-field pattern, or not at all.""",
     })  # fmt: skip

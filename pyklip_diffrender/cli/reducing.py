@@ -41,7 +41,10 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
+from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
+from pyklip_diffrender.reduction.visit import worth_joining
 from pyklip_diffrender.scene.exposure import proper_motion as motion_of
+from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import SHORT, Sequence
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
@@ -104,20 +107,23 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
     libraries = [systematics] if isinstance(systematics, PatternLibrary) else []
     library = combine_libraries([*libraries, package_library()])
     known = searched and known_systematics(sequence.science[0], library=library) is not None
-    stars = Counter(each.target for each in sequence.references)
+    teaching = frames_for_pattern(sequence, options)
+    stars = Counter(each.target for each in teaching)
     if known:
         steps += [
             (f"place of {each.name} on the detector", _PLACE * fit)
             for each in sequence.science
             if each.first_pixel is None
         ]
-    elif systematics == "references" or (searched and options.references == "pattern"):
+    elif searched or systematics == "references":
         steps += [(f"reference star {star}", fit * n**_FRAMES) for star, n in stars.items()]
     joint = fit * count**_FRAMES * (1 + _TIED * (options.star_flux is not None))
     steps.append(("wavefront", joint))
-    others = len(sequence.references) * (options.references == "joint" and not options.disk)
+    others: abc.Sequence[Observation] = frames_in_likelihood(sequence, options)
+    if known or (teaching and searched):
+        others = worth_joining(others)
     if others:
-        steps.append(("reference stars and target together", fit * _JOINT * (count + others)))
+        steps.append(("reference stars and target together", fit * _JOINT * (count + len(others))))
     refit = _DISK * joint * options.disk
     search = _SEARCH * area * count
     steps.append(("search", search))
@@ -152,8 +158,7 @@ def describe_plan(sequence: Sequence, options: ReduceOptions) -> str:
     steps = steps_of(sequence, options)
     lines = [f"{k}. {name}: about {duration(s)}" for k, (name, s) in enumerate(steps, 1)]
     total = sum(seconds for _, seconds in steps)
-    joins = options.references == "joint" and not options.disk
-    frames = len(sequence.science) + joins * len(sequence.references)
+    frames = len(sequence.science) + len(frames_in_likelihood(sequence, options))
     memory = _MEMORY + _MEMORY_PER_FRAME * frames * (options.side / 80) ** 2
     files = [row.path for row in sequence.rows if row.path is not None and row.path.exists()]
     largest = max((path.stat().st_size for path in files), default=0)

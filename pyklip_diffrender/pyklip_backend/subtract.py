@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.progress import heard_by
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
@@ -81,6 +82,13 @@ def subtract_by_refinement(
     tell(f"{_described(fit)}, {fit.seconds:.0f} s, flat-field pattern: {reduction.pattern}")
     tell(f"{counted(number, 'companion')} detected")
     warn_of_status(science[0].name, fit)
+    if references and not reduction.reference_frames:
+        warnings.warn(
+            f"{science[0].name}: the mode has RDI, but no frame of the library is used: "
+            f"{reduction.visit.in_words()}",
+            DiffrenderWarning,
+            stacklevel=2,
+        )
     cut = preparation.sequence.science
     fitted = tuple(
         FittedPointing(
