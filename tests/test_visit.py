@@ -10,10 +10,18 @@ from astropy.io import fits
 from astropy.time import Time
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.cli.reducing import steps_of
 from pyklip_diffrender.detection import sources_of_references
 from pyklip_diffrender.detection.error_factor import structures_in_single_roll
 from pyklip_diffrender.errors import CorruptFileError, ExistingFileError, IncompatibleSetupError
-from pyklip_diffrender.pattern import choose_systematics, is_known_beside, pattern_for_visit
+from pyklip_diffrender.pattern import (
+    PatternLibrary,
+    choose_systematics,
+    is_known_beside,
+    known_systematics,
+    measure_patterns,
+    pattern_for_visit,
+)
 from pyklip_diffrender.reduction import ReduceOptions, Visit, pipeline
 from pyklip_diffrender.reduction import visit as visits
 from pyklip_diffrender.reduction.klip import klip_curve
@@ -23,6 +31,7 @@ from pyklip_diffrender.refinement import GaussNewton, align_frame, join_frames, 
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.settings import exposure_sequences
 from pyklip_diffrender.scene import Observation, Planet
+from pyklip_diffrender.scene.exposure import CatalogueStar
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 SIZE, NPIX = 32, 64
@@ -266,6 +275,29 @@ def test_a_pattern_is_not_learned_twice_from_a_reference():
     assert pattern_for_visit(replace(choice, origin="none"), science()[:1], elsewhere) is None
 
 
+TEACHING, TOGETHER = "reference star HD 2", "reference stars and target together"
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "options", "planned"),
+    [
+        (3, 0, {}, [TOGETHER]),
+        (1, 0, {}, [TOGETHER]),
+        # Where the pattern is known, one frame of a star is not worth the time.
+        (1, 2, {}, [TEACHING]),
+        (3, 2, {}, [TEACHING, TOGETHER]),
+        (0, 2, {"references": "off"}, []),
+        (0, 2, {"systematics": "off"}, []),
+        (1, 1, {"references": "pattern"}, [TEACHING]),
+    ],
+)
+def test_a_plan_has_what_reference_frames_are_used_for(near, far, options, planned):
+    references = (*(reference(k) for k in range(near)), *(later(k) for k in range(far)))
+    sequence = dr.Sequence("HD 1", science(), references)
+    names = [name for name, _ in steps_of(sequence, ReduceOptions(size=SIZE, **options))]
+    assert [name for name in names if name in (TEACHING, TOGETHER)] == planned
+
+
 FLAT_FIELD = "jwst_nircam_flat_0001.fits"
 
 
@@ -309,6 +341,13 @@ def test_a_pattern_is_learned_from_stars_of_any_epoch_with_the_same_flat_field()
     # It is the flat field of the pixels: after a few steps, three frames show more than half of it.
     true = FLAT * np.random.default_rng(5).normal(size=(SIZE, SIZE))
     assert np.corrcoef(choice.systematics.pattern.flat, true.flat)[0, 1] > 0.6
+    # A library's pattern is averaged with it if it is an error of the same flat field.
+    first, measured = choice.science[0], measure_patterns(choice.references)
+    for flat, stars in ((FLAT_FIELD, ["HD 2", "HD 9"]), ("other.fits", ["HD 2"])):
+        others = [replace(p, star="HD 9", catalogue=CatalogueStar(), flat=flat) for p in measured]
+        library = PatternLibrary(tuple(others))
+        both = known_systematics(first, choice.references, library=library)
+        assert both.provenance["stars"] == stars
     # That of frames in the likelihood is not counted twice; that of other epochs is known beside.
     near, fitted = [reference(0)], [f.observation for fit in choice.references for f in fit.frames]
     assert is_known_beside(choice, near)
