@@ -201,7 +201,7 @@ def test_limits_are_compared_as_they_are_stated():
     frames = [reference(k) for k in range(3)]
     kept, visit, detection = with_references(fit, choice, frames[:2], search=search)
     assert (kept, detection) == (fit, None)
-    assert "add little to the library's pattern" in visit.contributions[0].reason
+    assert "only 2 frames of its star" in visit.contributions[0].reason
     kept, visit, detection = with_references(fit, choice, frames, search=search)
     assert searched[0] is fit
     assert len(searched) == 2

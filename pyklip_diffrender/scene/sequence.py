@@ -241,7 +241,8 @@ class Sequence:
             Date in the epoch to use, such as "2022-10-03", if the target was observed in several.
             Frames of one epoch are at most 5 days apart, and share a wavefront.
         references : iterable of path
-            Further files, of reference stars even if their headers do not say so.
+            Further files, of reference stars even if their headers do not say so, of any epoch and
+            programme.
         star : tuple of float, optional
             x, y of the target's star in its files, pixels from 0, in place of what the headers
             say. The files are then not judged by whether their light is that of a star there. For
