@@ -14,9 +14,6 @@ computed again. The table has, for each set:
   together, beside the number that is stated;
 - the ratio of the limit of the best single filter to that of the combination, for a planet of 1,500
   K, each at the threshold of equal false-alarm probability, beside the root of the summed squares.
-
-Last, background sources at two epochs, in smooth noise, and the share that is told apart from
-companions, by how far the star moves in units of the error of a place.
 """
 
 from __future__ import annotations
@@ -35,7 +32,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import Detection, Motion, SkyMap, hypotheses
+from pyklip_diffrender.detection import Detection, SkyMap
 from pyklip_diffrender.detection.field import separation_of
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
@@ -101,53 +98,11 @@ def deviation(detection: Detection) -> float:
     return float(np.nanstd(detection.snr[used]))
 
 
-def told_apart(ratio: float, count: int, snr: float = 8.0) -> float:
-    """Share of background sources that are told apart, for a motion in errors of a place."""
-    side, pixel, smooth, error = 41, 0.063, 1.2, 1e-6
-    half = (side - 1) / 2 * pixel
-    axis = np.linspace(-half, half, side)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1)
-    width = 2**0.5 * smooth * pixel
-    motion = ratio * width / snr
-    told = 0
-    for seed in range(count):
-        rng = np.random.default_rng([seed, round(100 * ratio)])
-        start = rng.uniform(0.3, 0.8, 2) * rng.choice([-1, 1], 2)
-        angle = rng.uniform(0, 2 * np.pi)
-        moved = motion * np.array([np.cos(angle), np.sin(angle)])
-        maps = []
-        for k, place in enumerate((start, start + moved)):
-            noise = _smooth(rng, side, smooth)
-            # East is to the left.
-            away = ((grid - place * [-1, 1]) ** 2).sum(axis=-1)
-            maps.append(
-                SkyMap(
-                    name=str(k), filter="F444W", mjd=59900.0 + 365.25 * k, north=0.0, grid=grid,
-                    snr=noise + snr * np.exp(-away / (2 * width**2)),
-                    error=np.full(noise.shape, error), noise=noise,
-                    freedom=np.full(noise.shape, np.inf), resolution=0.14,
-                )
-            )  # fmt: skip
-        motion_of_star = Motion((float(-moved[0]), float(-moved[1])))
-        flux = dict.fromkeys(("0", "1"), 1.0)
-        result = hypotheses(maps, flux, start, 59900.0, motion_of_star)
-        told += result.verdict.startswith("stays")
-    return told / count
-
-
-def _smooth(rng: np.random.Generator, side: int, smooth: float) -> np.ndarray:
-    from scipy.ndimage import gaussian_filter
-
-    field = gaussian_filter(rng.normal(size=(side + 40, side + 40)), smooth, mode="wrap")
-    return field[20:-20, 20:-20] / field.std()
-
-
 def main() -> None:
     """Simulate, combine, and write the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--sequences", type=int, default=12)
-    parser.add_argument("--sources", type=int, default=100)
     options = parser.parse_args()
     torch.set_num_threads(1)
     names: list[str] = []
@@ -166,9 +121,6 @@ def main() -> None:
             {"searches": len(parts)}
             | {key: float(np.mean([each[key] for each in parts])) for key in parts[0]}
         )
-    for ratio in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0):
-        names.append(f"background, motion of {ratio:g} errors")
-        rows.append({"told_apart": told_apart(ratio, options.sources)})
     columns = list(dict.fromkeys(key for row in rows for key in row))
     table = QTable({"set": names})
     for column in columns:
@@ -178,8 +130,7 @@ def main() -> None:
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
     ).stdout.strip()
     table.meta = {
-        "command": f"python -m benchmarks.combined --sequences {options.sequences} "
-        f"--sources {options.sources}",
+        "command": f"python -m benchmarks.combined --sequences {options.sequences}",
         "commit": commit, "date": Time.now().isot[:10], "threshold": LEVEL,
         "threads": os.environ.get("OMP_NUM_THREADS", "default"),
     }  # fmt: skip

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
         register,
         unregister,
     )
-    from pyklip_diffrender.reduction import Reduction, ReferenceStar, reduce
+    from pyklip_diffrender.reduction import Reduction, reduce
     from pyklip_diffrender.refinement import (
         GaussNewton,
         Refinement,
@@ -74,7 +74,6 @@ __all__ = [
     "PatternLibrary",
     "Planet",
     "Reduction",
-    "ReferenceStar",
     "Refinement",
     "Scene",
     "Sequence",
@@ -126,7 +125,7 @@ _NAMES = {
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",
     "pyklip_backend": "backend DiffrenderSettings observation_from_dataset register unregister",
-    "reduction": "reduce Reduction ReferenceStar",
+    "reduction": "reduce Reduction",
     "pattern": "combine_libraries known_systematics learn_library learn_systematics PatternLibrary",
     "refinement": "GaussNewton refine Refinement Status",
     "scene.objects": "Planet Scene Star",

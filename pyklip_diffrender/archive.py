@@ -132,10 +132,13 @@ def fetch_calints(
 ) -> list[Path]:
     """Fetch the calints files of a programme from MAST, for `reduce` or `Sequence.from_files`.
 
-    Needs the extra ``archive`` (astroquery) and a network. Files that are complete in the folder
-    are not fetched again; those of reference stars come along where the archive associates them
-    with the target. Proprietary files need a token of MAST in the environment variable
-    MAST_API_TOKEN.
+    Needs the extra ``archive`` (astroquery) and a network. Files of reference stars come along
+    where the archive associates them with the target. Proprietary files need a token of MAST in the
+    environment variable MAST_API_TOKEN.
+
+    Files that are in the folder with the size that the archive states are not fetched again. The
+    archive does not state with which version of the calibration (CAL_VER in the header) a file was
+    made: delete those that are to be replaced by newer ones.
 
     Parameters
     ----------

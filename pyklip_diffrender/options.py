@@ -241,10 +241,12 @@ class SharedOptions:
     star_flux: float | str | u.Quantity | None = field(default=None, metadata={
         "kind": float, "text": True, "stated_type": "float, str or Quantity, optional",
         "meaning": """Flux density of the star in the filter, from a catalogue or a model of its
-            spectrum: Jy, or an AB magnitude. Contrasts then refer to it, as spaceKLIP's do. By
+            spectrum: Jy, text such as "403 mJy", or an AB magnitude such as "9.8 mag(AB)".
+            Contrasts then refer to it, as spaceKLIP's do. By
             default the light that is diffracted around the mask determines the star's flux, to
-            10 %, which errors of contrasts include. Flux densities of planets do not depend on it.
-            Takes a second, shorter fit.""",
+            10 %, which errors of contrasts include; a value that differs from that by more than a
+            factor of three is refused after the fit, before the search. Flux densities of planets
+            do not depend on it. Takes a second, shorter fit.""",
         "expected": "a flux density in Jy, such as 0.45",
         "help": """Flux density of the star in the filter, such as "0.45 Jy", to which contrasts
             refer; default: what diffracted light says, to 10 %.""",

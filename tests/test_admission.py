@@ -7,14 +7,21 @@ from functools import cache
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.time import Time
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import fourier_shift, gaussian_filter
 
 import pyklip_diffrender as dr
-from benchmarks.calints_files import SIDE, calints, starlight
-from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.scene.exposure import CatalogueStar, beginning, image_mask
+from benchmarks.calints_files import CENTER, SIDE, calints, starlight
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.scene.exposure import (
+    CatalogueStar,
+    beginning,
+    common_motion,
+    image_mask,
+)
 
 FIRST, SECOND, THIRD = (f"jw0118400{k}001_03106_00001_nrcalong_calints.fits" for k in (1, 2, 3))
 
@@ -94,6 +101,7 @@ EXCLUDED = [
     ("pup.fits", {"PUPIL": "CLEAR"}, "PUPIL is CLEAR"),
     ("two.fits", {"CORONMSK": "MASKA430R"}, "CORONMSK MASKA430R.*name different masks"),
     ("area.fits", {"PIXAR_A2": 0.00096}, "^by PIXAR_A2 .*0.063 in NRCALONG"),
+    ("steradian.fits", {"PIXAR_SR": 0.0039}, "^PIXAR_SR is 0.0039, expected about 9.17e-14 sr"),
     ("old.fits", {"DATE-BEG": "2012-01-01"}, "^the exposure.*the launch"),
     ("mid.fits", {"EXPMID": 59000.5}, "EXPMID is 59000.5, expected about"),
     ("sum.fits", {"PA_APER": 12.0}, "PA_APER is 12.0, expected 70.050"),
@@ -184,6 +192,84 @@ def test_stars_are_told_apart_by_coordinates_and_signs():
     assert plus.separation(CatalogueStar((), (110.0 + 1e-3 / np.cos(np.deg2rad(20.2)), 20.2))) == (
         pytest.approx(3.6, rel=1e-6)
     )
+
+
+FAST = (3.0, 3.4)
+"""arcsec per year, by which a star goes 103 arcsec from 2000 to the end of 2022."""
+DATED = {"MU_RA": FAST[0], "MU_DEC": FAST[1], "MU_EPOCH": "2000-01-01 00:00:00.0000000"}
+UNDATED = {"MU_RA": 0.0, "MU_DEC": 0.0, "MU_EPOCH": "2000-01-01 00:00:00.0000000"}
+
+
+def place_in(date, dec=20.0):
+    """Cards of the coordinates of the fast star at a date, by astropy."""
+    star = SkyCoord(
+        100 * u.deg, dec * u.deg, pm_ra_cosdec=FAST[0] * u.arcsec / u.yr, distance=10 * u.pc,
+        pm_dec=FAST[1] * u.arcsec / u.yr, obstime=Time("2000-01-01"),
+    )  # fmt: skip
+    there = star.apply_space_motion(Time(date))
+    return {"TARG_RA": float(there.ra.deg), "TARG_DEC": float(there.dec.deg)}
+
+
+@pytest.mark.parametrize(
+    ("names", "cards", "dec"),
+    [
+        (("HD 1", "HD 1"), DATED, 20.0),
+        (("HD 1", "GJ 1"), DATED, 20.0),
+        (("HD 1", "GJ 1"), DATED | {"MU_EPOCH": 2000.0}, 20.0),
+        # Near the pole a proper motion is no change of coordinates at a constant rate.
+        (("HD 1", "GJ 1"), DATED, 89.8),
+        # Of names that agree, the motion that any star may have is enough.
+        (("HD 1", "hd-1"), UNDATED, 20.0),
+        (("HD 1", "HD 1"), {}, 20.0),
+    ],
+    ids=["one name", "two names", "a year", "pole", "zeros", "no cards"],
+)
+def test_a_star_with_coordinates_of_two_epochs_is_one(tmp_path, names, cards, dec):
+    """No card says whether TARG_RA is of the catalogue's epoch or of the exposure."""
+    for k, (name, date) in enumerate(zip(names, ("2000-01-01", "2022-10-03"), strict=True)):
+        place = place_in(date, dec)
+        another(tmp_path, f"{k}.fits", star=name, observation=k + 1, cards=cards | place,
+                roll=70.0 + 10 * k, date=f"2022-10-03T0{k}:00:00")  # fmt: skip
+    sequence = dr.Sequence.from_files(tmp_path)
+    assert uses(sequence) == {"0.fits": "target", "1.fits": "target"}
+
+
+@pytest.mark.parametrize(
+    ("names", "cards", "arcsec"),
+    [
+        (("HD 1", "GJ 1"), UNDATED, 10.0),
+        (("HD 1", "GJ 1"), DATED, 10.0),
+        # A motion of which no star is capable explains nothing.
+        (("HD 1", "GJ 1"), UNDATED | {"MU_RA": 3000.0, "MU_DEC": 3400.0}, 103.0),
+        (("TARGET", "TARGET"), DATED, 3600.0),
+        (("TARGET", "TARGET"), UNDATED, 3600.0),
+    ],
+)
+def test_what_the_motion_does_not_explain_are_two_stars(tmp_path, names, cards, arcsec):
+    for k, name in enumerate(names):
+        place = {"TARG_RA": 100.0, "TARG_DEC": 20.0 + k * arcsec / 3600}
+        another(tmp_path, f"{k}.fits", star=name, observation=k + 1, cards=cards | place)
+    with pytest.raises(IncompatibleSetupError, match=r"target: the files have"):
+        dr.Sequence.from_files(tmp_path)
+
+
+def test_proper_motions_of_headers_are_compared():
+    def motion(*pairs):
+        cards = [fits.Header({"MU_RA": east, "MU_DEC": north}) for east, north in pairs]
+        return common_motion((header, f"{k}.fits") for k, header in enumerate(cards))
+
+    # Zeros are what a proposal has that says nothing.
+    assert motion((0.0, 0.0)) is None
+    assert motion((0.0, 0.0), (0.28, -0.36)) == (0.28, -0.36)
+    assert motion((0.0, -0.36)) == (0.0, -0.36)
+    assert motion((0.28, -0.36), (0.284, -0.36)) == pytest.approx((0.282, -0.36))
+    with pytest.raises(
+        IncompatibleSetupError, match=r"0\.28, -0\.36 in 1\.fits and 0\.4, -0\.4 in 2"
+    ):
+        motion((0.0, 0.0), (0.28, -0.36), (0.4, -0.4))
+    with pytest.raises(CorruptFileError, match=r"281 and -360, expected .*milliarcseconds"):
+        motion((281.0, -360.0))
+    assert motion((-0.80, 10.36)) == (-0.80, 10.36)  # Barnard's star.
 
 
 @pytest.mark.parametrize(
@@ -374,6 +460,61 @@ def test_of_two_frames_that_differ_in_brightness_none_is_right(folder):
     another(folder, SECOND, change=times(SCI=2.5, ERR=2.5))
     with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND} contradict each other"):
         dr.Sequence.from_files(folder)
+
+
+def aligned_with_an_outlier(path, recorded):
+    """Shift a file by Fourier transform, as alignments do, with 1e6 for a NaN in ERR."""
+    shift = np.array([0.37, -0.21])
+    with fits.open(path) as hdus:
+        hdus = fits.HDUList([each.copy() for each in hdus])
+    hdus["ERR"].data[0, 60, 120] = 1e6
+    for name in ("SCI", "ERR"):
+        turned = fourier_shift(np.fft.fft2(hdus[name].data[0].astype(float)), shift[::-1])
+        hdus[name].data = np.fft.ifft2(turned).real[None].astype(np.float32)
+    if recorded:
+        hdus.append(fits.ImageHDU(shift[None], name="IMSHIFTS"))
+    hdus.writeto(path, overwrite=True)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_frame_with_errors_that_ring_is_left_out_and_the_others_go_on(folder, recorded):
+    aligned_with_an_outlier(folder / SECOND, recorded)
+    sequence = dr.Sequence.from_files(folder)
+    assert [each.name for each in sequence.science] == [FIRST]
+    ((name, reason),) = sequence.excluded
+    assert name == SECOND
+    assert re.search(
+        r"no pixel is valid|of the pixels within 2 arcsec of the star are valid", reason
+    )
+    assert "positive" in reason
+    for other in (FIRST, THIRD):
+        (folder / other).unlink()
+    with pytest.raises(NoValidPixelsError, match=f"{SECOND}: .* valid"):
+        dr.Sequence.from_files(folder)
+
+
+def test_a_frame_without_valid_pixels_about_the_star_is_left_out(folder):
+    def change(arrays):
+        rows, columns = np.indices(arrays["DQ"].shape[1:])
+        near = np.hypot(columns - CENTER[0], rows - CENTER[1]) * 0.0624 < 1.2
+        arrays["DQ"][:, near] = 1
+
+    another(folder, change=change)
+    another(folder, "y.fits", date="2022-10-03T14:00:00", observation=9, cards={"CRPIX1": 400.0})
+    sequence = dr.Sequence.from_files(folder)
+    assert as_before(sequence)
+    # 64 % of a circle of 2 arcsec are more than 1.2 arcsec from its middle.
+    assert reasons(sequence)["x.fits"].startswith("64% of the pixels within 2 arcsec of the star")
+    assert "is not in the frame of 180 x 180 pixels" in reasons(sequence)["y.fits"]
+
+
+def test_what_too_few_pixels_leave_open_is_said(tmp_path):
+    small = starlight()[78:105, 75:102]
+    path = calints(tmp_path / "small.fits", light=small, cards={"CRPIX1": 14.0, "CRPIX2": 14.0})
+    (frame,) = dr.Sequence.from_files(path).science
+    assert "1.2 arcsec from the star: whether a star is there" in frame.remarks[0]
+    whole = calints(tmp_path / "whole.fits")
+    assert dr.Sequence.from_files(whole).science[0].remarks == ()
 
 
 def test_a_pixel_that_is_missing_at_the_peak_moves_nothing(shared_data, tmp_path):
@@ -600,11 +741,25 @@ def test_a_star_off_the_mask_is_refused_unless_the_user_insists(shared_data, tmp
             hdus["SCI"].data[:] = np.roll(data, (17, -17), axis=(1, 2))
 
     path = real_roll(shared_data, tmp_path / "a.fits", change)
-    with pytest.raises(NoValidPixelsError, match=r"a\.fits: its light is centred 1\.5.*--star"):
+    with pytest.raises(
+        NoValidPixelsError, match=r"a\.fits: its light is centred 1\.5.*with the.*star"
+    ):
         dr.Sequence.from_files(path)
     (frame,) = dr.Sequence.from_files(path, star=(150.0, 174.5)).science
     # The whole pixels of the alignment are undone.
     assert np.abs((frame.center[0] - (150.0, 174.5) + 0.5) % 1 - 0.5).max() < 0.6
+
+
+def test_a_place_of_the_star_is_in_its_frames(shared_data, caplog):
+    """Of files of 320 x 320 pixels whose headers have it at 150, 174, from 0."""
+    path = shared_data / "gto1184" / "jw01184003001_03106_00001_nrcalong_calints.fits.gz"
+    for place in ((400.0, 10.0), (-5.0, 150.0), (150.0, 320.0)):
+        words = rf"star: got x, y = {place[0]:g}, {place[1]:g}, expected a place in its 320 x 320"
+        with pytest.raises(NoValidPixelsError, match=words):
+            dr.Sequence.from_files(path, star=place)
+    assert "counted from 1" not in caplog.text
+    dr.Sequence.from_files(path, star=(151.0, 175.0))
+    assert "counted from 1; expected pixels from 0, 150, 174" in caplog.text
 
 
 def test_a_place_of_the_star_is_two_numbers(folder):

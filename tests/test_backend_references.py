@@ -253,6 +253,19 @@ def test_the_map_of_a_folder_is_chosen_by_the_date(opd, date, hours, maps, files
     assert header["DROPDHRS"] == pytest.approx(hours, abs=0.001)
 
 
+def test_a_map_that_was_written_again_is_chosen_by_its_new_date(maps, files, tmp_path):
+    """Writing into a file does not change the time of its folder."""
+    unregister()
+    register(opd=maps, subtractor=render)
+    first = reduce(JWSTData(files[:2]), tmp_path / "first", mode="ADI")
+    chosen = maps / first["DROPD"]
+    time = maps.stat().st_mtime_ns
+    fits.setval(chosen, "DATE-OBS", value="2022-12-01T00:00:00")
+    assert maps.stat().st_mtime_ns == time
+    second = reduce(JWSTData(files[:2]), tmp_path / "second", mode="ADI")
+    assert (first["DROPD"], second["DROPD"]) == ("map_2022-08-01.fits", "map_2022-07-28.fits")
+
+
 def test_a_map_needs_a_folder_and_the_frames_a_date(maps, files, tmp_path):
     unregister()
     undated = JWSTData(files[:2])
@@ -268,9 +281,6 @@ def test_a_map_needs_a_folder_and_the_frames_a_date(maps, files, tmp_path):
     ("settings", "call", "message"),
     [
         ({}, {"calibrate_flux": True}, "JWSTData has no flux calibration"),
-        ({"model_options": {"npx": 64}}, {}, "npx: not known to nircam_coronagraph"),
-        ({"systematics": "maybe"}, {}, "'maybe', expected 'auto', 'references'"),
-        ({"max_chi2": -1.0}, {}, "max_chi2: got -1.0"),
     ],
 )
 def test_mistakes_are_found_before_the_fit(settings, call, message, files, tmp_path):

@@ -123,7 +123,7 @@ def test_a_library_that_is_not_used_is_said_with_the_reason(frames, small):
     assert "of 1 reference frame 1 not used by the fit" in said[0]
     assert subtracted.references == 0
     (contribution,) = subtracted.reduction.visit.contributions
-    assert "--references" in contribution.reason
+    assert "the option references is 'off'" in contribution.reason
 
 
 @pytest.mark.slow

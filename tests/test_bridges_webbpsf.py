@@ -85,7 +85,7 @@ def test_a_script_for_stpsf_runs_unchanged(nircam, tmp_path):
         for k in range(4):
             assert error(psf[k].data, truth[k].data) < 1e-10
             assert np.array_equal(written[k].data, psf[k].data)
-    with pytest.raises(FileExistsError, match="overwrite=True"):
+    with pytest.raises(FileExistsError, match="overwrite"):
         model.calc_psf(outfile=path, overwrite=False, **call)
     arcsec = {"monochromatic": 4.2e-6, "fov_arcsec": 1.6, "fft_oversample": 2}
     one = {"detector_oversample": 1, "add_distortion": False, "normalize": "last"}

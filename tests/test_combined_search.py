@@ -12,14 +12,15 @@ from astropy.coordinates import GCRS, SkyCoord
 from astropy.table import QTable
 from astropy.time import Time
 from scipy import stats
-from synthetic_searches import CURVATURE, PIXEL, noise, searched
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import Motion
+from benchmarks.reliability import reliability, system
+from benchmarks.synthetic_searches import CURVATURE, PIXEL, found, noise, searched
+from pyklip_diffrender.detection import Motion, checked_motion
 from pyklip_diffrender.detection.error_factor import ErrorFactor, structures_in_single_roll
 from pyklip_diffrender.detection.sky_map import Family, SkyStack
 from pyklip_diffrender.detection.templates import weigh
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.linear.model import LinearModel, Unknown
 from pyklip_diffrender.reduction import search_together
@@ -230,7 +231,7 @@ def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path):
     short = tmp_path / "short.txt"
     short.write_text("# micron Y T\n3.0 1 1\n3.5 2 nan\n4.2 3 2\n", encoding="utf-8")
     good = [searched("F444W"), searched("F356W")]
-    for found, spectra, words in (
+    for reductions, spectra, words in (
         ([one, other], None, "HD 1 and HD 2"),
         ([good[0], searched("F356W", north=None)], None, "no position angle"),
         ([good[0], searched("F444W", 2, mjd=60400.0)], None, "proper_motion="),
@@ -239,7 +240,7 @@ def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path):
         (good, str(short), "Y: .* F444W needs"),
     ):
         with pytest.raises(IncompatibleSetupError, match=words):
-            dr.combine(found, **({} if spectra is None else {"spectra": spectra}))
+            dr.combine(reductions, **({} if spectra is None else {"spectra": spectra}))
 
 
 def test_spectra_come_from_a_table_of_model_atmospheres(tmp_path):
@@ -349,6 +350,183 @@ def test_a_faint_companion_is_found_in_the_sum_of_epochs():
     assert both.candidates["search"][0] == "all epochs, with the star"
     # Free fluxes of a single filter are no family of their own.
     assert all(name.endswith("spectra") for name in both.thresholds)
+
+
+SKY = -np.array(MOTION) * 400 / YEAR
+"""How far a source in the background moves beside the star in 400 days."""
+
+ONE, TWO, THREE = np.array([0.5, 0.45]), np.array([-0.6, 0.3]), np.array([-0.2, -0.8])
+
+
+def at_epochs(*sources, listed=True):
+    """Searches of 400 days apart; sources are lists of (east, north, S/N) by epoch."""
+    return [
+        found(
+            "F444W", 7 + k, present, mjd=59900.0 + 400 * k, north=25.0 * k,
+            threshold=5.0 if listed else np.inf,
+        )
+        for k, present in enumerate(sources)
+    ]  # fmt: skip
+
+
+def verdicts(reductions, **options):
+    """Verdicts by the place of the candidate at the epoch to which it belongs."""
+    both = dr.combine(reductions, proper_motion=MOTION, **options)
+    table = both.candidates
+    return {
+        (round(float(row["delta_ra"].value), 1), round(float(row["delta_dec"].value), 1)): row[
+            "verdict"
+        ]
+        for row in table
+    }
+
+
+BOUND = "moves with the star"
+BACKGROUND = "stays on the sky: a source in the background"
+NEITHER = "neither moves with the star nor stays on the sky"
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_one_source_is_not_explained_by_another(listed):
+    """Two companions: the light of the brighter one is no place of the fainter one."""
+    both = at_epochs(*(2 * [[(*ONE, 12.0), (*TWO, 15.0)]]), listed=listed)
+    assert verdicts(both) == {(0.5, 0.5): BOUND, (-0.6, 0.3): BOUND}
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_companion_beside_a_background_star(listed):
+    mixed = at_epochs(
+        [(*ONE, 12.0), (*TWO, 20.0)], [(*ONE, 12.0), (*(TWO + SKY), 20.0)], listed=listed
+    )
+    assert set(verdicts(mixed).values()) == {BOUND, BACKGROUND}
+
+
+def test_sources_that_come_and_go_are_two():
+    # One is seen at the first epoch only, one at the second, and a companion at both.
+    changed = at_epochs([(*ONE, 12.0), (*TWO, 14.0)], [(*ONE, 12.0), (*THREE, 13.0)])
+    assert verdicts(changed) == {
+        (0.5, 0.5): BOUND, (-0.6, 0.3): NEITHER, (-0.2, -0.8): NEITHER,
+    }  # fmt: skip
+
+
+def test_a_faint_companion_next_to_one_a_hundred_times_brighter():
+    """At 1.5 lambda/D, where a single search separates them."""
+    beside = ONE + np.array([0.21, 0.0])
+    both = dr.combine(
+        at_epochs(*(2 * [[(*ONE, 8.0), (*beside, 800.0)]])), proper_motion=MOTION
+    ).candidates
+    assert list(both["verdict"]) == [BOUND, BOUND]
+    # In the mean of both epochs the error of a contrast is that of one over the root of two.
+    assert both["contrast_F444W"][1] == pytest.approx(8e-6, abs=4 * 1e-6 / math.sqrt(2))
+    assert both["contrast_F444W"][0] == pytest.approx(8e-4, abs=4 * 1e-6 / math.sqrt(2))
+
+
+def test_a_source_that_leaves_the_field_is_not_decided_against():
+    """In the background, it would be outside at the second epoch, where nothing is known."""
+    edge = np.array([-1.7, 0.2])
+    gone = dr.combine(at_epochs([(*edge, 15.0), (*ONE, 9.0)], [(*ONE, 9.0)]), proper_motion=MOTION)
+    row = gone.candidates[
+        np.argmax(gone.candidates["snr_F444W"] * (gone.candidates["delta_ra"] < 0))
+    ]
+    assert row["probability_bound"] < 1e-6
+    assert row["probability_background"] == pytest.approx(row["probability_neither"], rel=0.1)
+
+
+def test_five_sources_at_four_epochs_keep_their_identities():
+    """Two companions, two background stars, and one that is seen once, crossing each other."""
+    stars = [np.array([0.6, -0.3]), np.array([-0.4, -0.9])]
+    moved = [[(*ONE, 9.0), (*TWO, 30.0)] + [(*(s + k * SKY / 2), 15.0) for s in stars]
+             for k in range(4)]  # fmt: skip
+    moved[2].append((*THREE, 11.0))
+    reductions = [
+        found("F444W", 70 + k, present, mjd=59900.0 + 200 * k, north=25.0 * k)
+        for k, present in enumerate(moved)
+    ]
+    both = dr.combine(reductions, proper_motion=MOTION)
+    assert sorted(both.candidates["verdict"]) == sorted(2 * [BOUND] + 2 * [BACKGROUND] + [NEITHER])
+    assert sorted(np.unique(both.sightings["candidate"], return_counts=True)[1]) == [1, 4, 4, 4, 4]
+
+
+def test_a_place_is_where_the_signal_is_highest():
+    """Degrees of freedom that rise from 15 to 180 in an arcsec: significance peaks elsewhere."""
+    x = np.linspace(-1.89, 1.89, 61)
+    freedom = 15 + 165 * np.clip(np.hypot(*np.meshgrid(x, x)), 0, 1)
+    places = [(0.3, 0.5), (-0.5, 0.6), (0.1, -0.9)]
+    sources = [(*place, snr) for place, snr in zip(places, (30.0, 45.0, 95.0), strict=True)]
+    for listed in (5.0, np.inf):
+        both = dr.combine([
+            found(name, k, sources, freedom=freedom, threshold=listed)
+            for k, name in enumerate(("F444W", "F356W"))
+        ]).candidates  # fmt: skip
+        assert len(both) == 3
+        for place, snr in zip(places, (30.0, 45.0, 95.0), strict=True):
+            away = np.hypot(both["delta_ra"].value - place[0], both["delta_dec"].value - place[1])
+            row = both[np.argmin(away)]
+            # Noise moves a peak of S/N z in one filter by 1 / (z sqrt(L)) in each direction.
+            assert away.min() < 4 / (snr * math.sqrt(CURVATURE))
+            assert row["contrast_F444W"] == pytest.approx(snr * 1e-6, abs=4e-6)
+
+
+def test_a_motion_that_no_star_has_is_refused():
+    mas = u.mas
+    assert checked_motion(None, 45 * mas, 1.0) == (None, pytest.approx(0.045), 1.0)
+    proper, parallax, _ = checked_motion(("377 mas/yr", "-90 mas/yr"), "70 mas")
+    assert proper == pytest.approx((0.377, -0.09))
+    assert parallax == pytest.approx(0.07)
+    # An empty proposal has zeros.
+    assert checked_motion((0.0, 0.0), 0)[0] is None
+    for motion, words in (
+        (((377.0, -90.0), None), "377 mas/yr"),
+        ((None, 70.0), "70 mas"),
+        ((None, "a lot"), "'a lot'"),
+        (((0.1, 0.2, 0.3), None), r"shape \(3,\)"),
+    ):
+        with pytest.raises(IncompatibleSetupError, match=words):
+            checked_motion(*motion)
+    with pytest.raises(UnitError, match="arcsec"):
+        checked_motion(None, 3 * u.pc)
+    with pytest.raises(IncompatibleSetupError, match="proper_motion: got 377"):
+        dr.combine([searched("F444W"), searched("F356W")], proper_motion=(377.0, 0.0))
+
+
+def test_headers_that_disagree_on_the_motion_are_refused():
+    def dated(mjd, motion):
+        cards = {"MU_RA": motion, "MU_DEC": 0.1}
+        return searched("F444W", int(mjd), [(*ONE, 9.0)], mjd=mjd, header=cards)
+
+    alike = dr.combine([dated(59900.0, 0.3), dated(60300.0, 0.304)])
+    assert alike.motion.proper == pytest.approx((0.302, 0.1))
+    with pytest.raises(IncompatibleSetupError, match=r"disagree .* 0\.3, 0\.1; 0\.9, 0\.1"):
+        dr.combine([dated(59900.0, 0.3), dated(60300.0, 0.9)])
+
+
+def test_a_candidate_below_the_threshold_of_the_combination_is_named():
+    """The threshold of two filters is 5.3, that of each is 5."""
+    one = found("F444W", 3, [(*ONE, 5.2)], threshold=4.0)
+    both = dr.combine([one, searched("F356W", 2)])
+    assert len(one.candidates) == 1
+    assert (len(both.candidates), len(both.remarks)) in ((0, 1), (1, 0))
+    low = found("F444W", 3, [(*ONE, 4.4)], threshold=4.0)
+    both = dr.combine([low, searched("F356W", 2)])
+    assert len(both.candidates) == 0
+    assert "below the threshold of the combined search" in both.remarks[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("epochs", "filters", "count"), [(2, 1, 40), (3, 2, 8)])
+def test_probabilities_are_frequencies(epochs, filters, count):
+    """Systems of one to five sources of S/N 5 to 25, with slow stars, so that many are unclear."""
+    result = reliability([system(seed, epochs, filters) for seed in range(count)])
+    assert result.unexplained == 0
+    for low, high in ((0.0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 1.01)):
+        chosen = (result.stated >= low) & (result.stated < high)
+        expected, variance = result.stated[chosen].sum(), (
+            result.stated * (1 - result.stated))[chosen].sum()  # fmt: skip
+        # Hypotheses about one source are not independent: a factor of two in the variance.
+        assert abs(result.true[chosen].sum() - expected) < 1 + 3 * math.sqrt(2 * variance)
+    # Known to 1 / sqrt(2 n), a tenth or so.
+    assert np.std(result.place_pulls) == pytest.approx(1, abs=0.2)
+    assert np.std(result.flux_pulls) == pytest.approx(1, abs=0.25)
 
 
 @pytest.mark.slow

@@ -1,35 +1,28 @@
-"""Epochs and filters of a star: candidates that move with it, background sources, colours."""
+"""Epochs and filters of a star: the page that shows them together, and the command."""
 
 import json
 
 import numpy as np
-import pytest
 from astropy.io import fits
-from synthetic_searches import searched
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
+from benchmarks.synthetic_searches import searched
 from pyklip_diffrender.cli import main
-from pyklip_diffrender.reduction import (
-    combined_rows,
-    compare_reductions,
-    in_words,
-    write_comparison,
-)
-from pyklip_diffrender.reduction.several import sources_of
+from pyklip_diffrender.reduction import combined_rows, in_words, write_comparison
 
 MOTION = (0.28, -0.36)
 """Of AU Mic, arcsec per year."""
 
 
-def summary(mjd, places, error=0.01, filter="F444W", mag=20.0):
+def summary(mjd, places):
     """What a reduction says about candidates at offsets to the east and north."""
     candidates = [
         {
-            "separation_arcsec": float(np.hypot(*place)), "separation_error_arcsec": error,
+            "separation_arcsec": float(np.hypot(*place)), "separation_error_arcsec": 0.01,
             "position_angle_deg": float(np.degrees(np.arctan2(*place))),
-            "position_angle_error_deg": float(np.degrees(error / np.hypot(*place))),
-            "snr": 9.0, "contrast": 1e-5, "contrast_error": 1e-6, "ab_mag": mag,
+            "position_angle_error_deg": float(np.degrees(0.01 / np.hypot(*place))),
+            "snr": 9.0, "contrast": 1e-5, "contrast_error": 1e-6, "ab_mag": 20.0,
             "ab_mag_error": 0.1,
         }
         for place in places
@@ -37,96 +30,24 @@ def summary(mjd, places, error=0.01, filter="F444W", mag=20.0):
     return {
         "target": "AU Mic <b>", "oriented": True, "epoch_mjd": mjd, "sentence": "Result.",
         "first_date": "2022-10-03T00:00:00" if mjd < 60000 else "2023-12-02T00:00:00",
-        "filter": filter, "candidates": candidates, "threshold_snr": 6.0,
-        "contrast_curve": {
-            "sigmas": 5.0, "separation_arcsec": [0.4, 1.0], "contrast": [1e-5, 3e-6],
-        },
+        "filter": "F444W", "candidates": candidates,
     }  # fmt: skip
 
 
-def test_filters_of_an_epoch_are_compared_by_place_and_colour():
-    """One source in both filters, one in the first only, one beyond the curve of the other."""
-    long = summary(59855.0, [(0.8, -0.5), (-0.5, 0.5), (1.5, 0.0)], mag=20.0)
-    short = summary(59855.1, [(0.81, -0.5)], filter="F210M", mag=21.5)
-    pairs = compare_reductions([long, short], MOTION)
-    (pair,) = pairs
-    assert pair["candidates"] == [1, 1]
-    assert pair["verdict"] == "at one place"
-    assert pair["colour_mag"] == pytest.approx(-1.5)
-    assert pair["colour_error_mag"] == pytest.approx(0.1 * np.sqrt(2))
-    sources = sources_of([long, short], pairs)
-    assert [[each["candidates"] for each in source["filters"]] for source in sources] == [
-        [[1], [1]], [[2], []], [[3], []]
-    ]  # fmt: skip
-    limits = [source["filters"][1]["limit"] for source in sources]
-    assert limits[0] is limits[2] is None
-    # Between the two points of the curve, for an S/N of 6.
-    fraction = (np.hypot(0.5, 0.5) - 0.4) / 0.6
-    assert limits[1] == pytest.approx(1.2 * (1e-5 + fraction * (3e-6 - 1e-5)))
-    # Epochs of one filter have no such table, and no colour.
-    later = summary(60280.0, [(0.8, -0.5)])
-    pairs = compare_reductions([long, later], MOTION)
-    assert all(each["colour_mag"] is None for each in pairs)
-    assert sources_of([long, later], pairs) == []
-    assert sources_of([summary(59855.0, []), short | {"candidates": []}], []) == []
-
-
-def test_a_companion_moves_with_the_star_and_the_background_stays():
-    years = 425 / 365.25
-    bound, sky = np.array([0.8, -0.5]), np.array([-1.2, 1.0])
-    moved = -np.array(MOTION) * years
-    second = summary(60280.0, [sky + moved, bound + np.array([0.01, -0.01]), (2.0, 2.0)])
-    pairs = compare_reductions([summary(59855.0, [bound, sky]), second], MOTION)
-    found = {tuple(pair["candidates"]): pair for pair in pairs}
-    assert {key: pair["verdict"] for key, pair in found.items()} == {
-        (1, 2): "moves with the star", (2, 1): "stays on the sky: a source in the background"
-    }  # fmt: skip
-    np.testing.assert_allclose(found[2, 1]["moved_arcsec"], moved, atol=1e-9)
-    assert found[2, 1]["chi2_with_sky"] == pytest.approx(0, abs=1e-9)
-    # Moved by (0.01, -0.01) with errors of hypot(0.01, 0.003) in each of two epochs.
-    assert found[1, 2]["chi2_with_star"] == pytest.approx(2e-4 / (2 * 1.09e-4), rel=1e-6)
-
-
-def test_a_star_that_hardly_moves_tells_nothing():
-    places = [(0.8, -0.5)]
-    frames = [summary(59855.0, places), summary(60280.0, places)]
-    (pair,) = compare_reductions(frames, (0.002, 0.001))
-    assert pair["verdict"].startswith("either")
-    (pair,) = compare_reductions(frames, None)
-    assert pair["chi2_with_sky"] is None
-    assert "not known" in pair["verdict"]
-    assert compare_reductions([frames[0] | {"oriented": False}, frames[1]], MOTION) == []
-
-
-def test_the_page_of_epochs_links_to_each(tmp_path):
+def test_the_page_links_to_each_reduction(tmp_path):
     folders = {
         "2022-10-03": summary(59855.0, [(0.8, -0.5)]), "2023-12-02": summary(60280.0, [(0.8, -0.5)])
     }  # fmt: skip
-    html, data = write_comparison(folders, MOTION, tmp_path)
+    html, data = write_comparison(folders, tmp_path, "the star's proper motion <b>")
     text = html.read_text(encoding="utf-8")
     assert 'href="2022-10-03/report.html"' in text
-    assert "moves with the star" in text
+    assert "no combined search. the star&#39;s" in text
     assert "<b>" not in text
     content = json.loads(data.read_text(encoding="utf-8"))
     assert [each["folder"] for each in content["reductions"]] == list(folders)
-    assert content["sources"] == []
-    assert content["pairs"][0]["verdict"] == "moves with the star"
-    write_comparison({key: summary(59855.0, []) for key in folders}, None, tmp_path)
+    assert content["combined"] == {"reason": "the star's proper motion <b>"}
+    write_comparison({key: summary(59855.0, []) for key in folders}, tmp_path, "none")
     assert "There are no candidates" in html.read_text(encoding="utf-8")
-
-
-def test_the_page_has_a_table_of_candidates_over_filters(tmp_path):
-    folders = {
-        "F444W": summary(59855.0, [(0.8, -0.5), (-0.5, 0.5)]),
-        "F210M": summary(59855.1, [(0.8, -0.5)], filter="F210M", mag=21.5),
-    }
-    html, data = write_comparison(folders, None, tmp_path)
-    text = html.read_text(encoding="utf-8")
-    assert 'href="F210M/report.html"' in text
-    table = text.partition("Candidates over filters")[2].partition("</section>")[0]
-    assert "(1) 20.00 ± 0.10, S/N 9.0</td><td>(1) 21.50 ± 0.10, S/N 9.0" in table
-    assert "&lt; 7.7 × 10⁻⁶" in table
-    assert len(json.loads(data.read_text(encoding="utf-8"))["sources"]) == 2
 
 
 def test_the_page_shows_the_combined_search(tmp_path):
@@ -137,7 +58,7 @@ def test_the_page_shows_the_combined_search(tmp_path):
         searched("F356W", 3, status="MODEL_MISMATCH"),
     ]
     combination = dr.combine(found, proper_motion=MOTION)
-    html, data = write_comparison(folders, MOTION, tmp_path, combination)
+    html, data = write_comparison(folders, tmp_path, combination)
     text = html.read_text(encoding="utf-8")
     assert "moves with the star" in text
     assert "MODEL_MISMATCH" in text
@@ -149,10 +70,9 @@ def test_the_page_shows_the_combined_search(tmp_path):
     assert row[1].startswith(("0.65", "0.66", "0.67", "0.68", "0.69"))
     assert "S/N" in row[title.index("Contrast in F444W")]
     assert "1 candidate\n" in in_words(combination)
-    html, data = write_comparison(folders, MOTION, tmp_path, "the star's proper motion <b>")
-    assert "no combined search. the star&#39;s" in html.read_text(encoding="utf-8")
-    content = json.loads(data.read_text(encoding="utf-8"))
-    assert content["combined"] == {"reason": "the star's proper motion <b>"}
+    # The way of a source in the background is drawn for the candidate.
+    assert text.count("the way of a source in the background") == 1
+    assert [each["epoch_mjd"] for each in content["sightings"]] == [59855.0, 60280.0]
 
 
 def dry_run(folder):
@@ -203,6 +123,12 @@ def test_the_command_takes_every_filter_of_the_target(tmp_path, capsys):
     sed.write_text("1 2\n2 0.8\n3 0.4\n4 0.3\n5 0.2\n6 0.1\n", encoding="utf-8")
     assert main([*options, "--star-sed", str(sed)]) == 0
     assert shows(capsys, "Jy in F444W", "Jy in F356W")
-    # Spectra are read before the first fit.
+    # Motion and spectra are checked before the first fit.
+    assert main([*options, "--parallax", "70"]) == 2
+    assert shows(capsys, "no star has more than 0.7685", "give 70 mas")
+    assert main([*options, "--proper-motion", "377", "-90"]) == 2
+    assert shows(capsys, "no star is faster", "377 mas/yr")
+    motion = ["--proper-motion", "377 mas/yr", "-90 mas/yr", "--parallax", "70 mas"]
+    assert main([*options, *motion]) == 0
     assert main([*options, "--spectra", str(tmp_path / "none.ecsv")]) == 1
     assert shows(capsys, "none.ecsv: no such file")

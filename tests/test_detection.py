@@ -516,7 +516,7 @@ def test_a_detection_from_a_file_measures_with_its_fit(world, one, tmp_path):
     with pytest.raises(IncompatibleSetupError, match="not the one that was searched"):
         Detection.read(folder, fit=world.fitted(0))
     one.fits[0].write(folder / "fit.fits", linear=False)
-    with pytest.raises(IncompatibleSetupError, match=r"with derivatives=True \(--derivatives\)"):
+    with pytest.raises(IncompatibleSetupError, match="with the option derivatives"):
         Detection.read(folder).measure(places)
     one.fits[0].write(folder / "fit.fits", overwrite=True)
     for again in (Detection.read(folder), Detection.read(folder, fit=one.fits)):

@@ -88,6 +88,16 @@ REFUSED = {
     r"NRCA5.*F444W.*NRCB5; use crosstalk=False": partial(
         instrument.nircam_coronagraph, "F444W", module="B", crosstalk=True
     ),
+    **{
+        message: partial(instrument.nircam_coronagraph, "F444W", **argument)
+        for message, argument in {
+            "npix: got '128', expected a whole number": {"npix": "128"},
+            r"npix: got 128\.5, expected a whole number": {"npix": 128.5},
+            "nlambda: got 0, expected a whole number, 1 or more": {"nlambda": 0},
+            "oversample: got 0, expected a whole number": {"oversample": 0},
+            "defaults: got bogus, expected some of star_offset": {"defaults": {"bogus": 1.0}},
+        }.items()
+    },
 }
 
 

@@ -9,14 +9,21 @@ import pytest
 import torch
 from astropy import units as u
 from astropy.io import fits
+from astropy.time import Time
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints
 from pyklip_diffrender import errors
-from pyklip_diffrender.pattern import MeasuredPattern, choose_systematics, package_library
+from pyklip_diffrender.pattern import (
+    MeasuredPattern,
+    as_request,
+    choose_systematics,
+    combine_patterns,
+    package_library,
+)
 from pyklip_diffrender.pyklip_backend import subtract_by_refinement
-from pyklip_diffrender.pyklip_backend.klip_call import check_settings
-from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.reduction import ReduceOptions, prepare
+from pyklip_diffrender.scene.systematics import caveat
 
 SIZE = 32
 FLAT = "crds://jwst_nircam_flat_9999.fits"
@@ -101,6 +108,25 @@ def test_the_pattern_of_one_star_holds_for_the_other(frames, tmp_path):
         np.testing.assert_allclose(one.value, other.value, atol=1e-9)
 
 
+@pytest.mark.parametrize(("card", "value"), [("ROLL_REF", 171.0), ("R_FLAT", "new.fits")])
+def test_frames_whose_header_was_corrected_are_fitted_again(
+    frames, tmp_path, monkeypatch, card, value
+):
+    """The pixels are the same; date, flat field and star of a pattern are those of the header."""
+    (path, *_) = sorted(frames.iterdir())
+    kept = tmp_path / "fits"
+    learned([path], folder=kept)
+    (first,) = kept.iterdir()
+    fits.setval(path, card, value=value, ext=int(card == "ROLL_REF"))
+    learned([path], folder=kept)
+    (last,) = set(kept.iterdir()) - {first}
+    (frame,) = dr.Refinement.read(last).frames
+    assert frame.observation.header[card] == value
+    # With the header as it was corrected, nothing is fitted any more.
+    monkeypatch.setattr("pyklip_diffrender.pattern.learn.refine", None)
+    learned([path], folder=kept)
+
+
 def test_stars_and_filters_that_are_not_there_are_refused(frames):
     with pytest.raises(
         errors.IncompatibleSetupError, match=r"star: got 'HD 7', expected one of 'HD 1'"
@@ -160,6 +186,10 @@ def test_a_library_is_searched_by_setup_place_star_and_flat():
     catalogue = replace(measured("A").catalogue, names=("G 80-21",), coordinates=(53.1001, -9.4))
     library = dr.PatternLibrary((measured("G 80-21", catalogue=catalogue), measured("B")))
     assert [each.star for each in library.matching(frame)] == ["B"]
+    # Nor do the coordinates of another epoch make it another star.
+    moved = {"MU_RA": 0.0, "MU_DEC": 4.5, "MU_EPOCH": "2000-01-01", "DATE-BEG": "2022-12-01"}
+    frame = observation(TARGPROP="Target 7", TARG_RA=53.1, TARG_DEC=-9.4 + 103.1 / 3600, **moved)
+    assert [each.star for each in library.matching(frame)] == ["B"]
 
 
 def test_pedestals_are_brought_together():
@@ -180,7 +210,10 @@ def test_pedestals_are_brought_together():
 def test_libraries_survive_their_files_and_are_combined(tmp_path):
     unknown = measured("B").variance.copy()
     unknown[3, 4] = np.inf
-    catalogue = replace(measured("A").catalogue, names=("A", "Ä 1"), coordinates=(10.0, 2.0))
+    catalogue = replace(
+        measured("A").catalogue, names=("A", "Ä 1"), coordinates=(10.0, 2.0), motion=(0.3, -0.2),
+        epochs=(2000.5, Time(measured("A").date).jyear),
+    )  # fmt: skip
     first = dr.PatternLibrary((measured("A", catalogue=catalogue), measured("B", variance=unknown)))
     second = dr.PatternLibrary(
         (measured("B", value=np.zeros_like(unknown)), measured("C", light=None))
@@ -218,9 +251,10 @@ def test_a_folder_of_libraries_is_a_choice_of_systematics(tmp_path):
     other = replace(observation(R_FLAT="jwst_nircam_flat_0465.fits"), first_pixel=(620, 1650))
     chosen = choose_systematics([other], [], model(), OPD, systematics=options.systematics)
     assert chosen.label == "library (HIP17695, G-7-34)"
-    check_settings(dr.DiffrenderSettings(systematics=tmp_path / "own"))
+    settings = dr.DiffrenderSettings(systematics=tmp_path / "own")
+    assert len(settings.systematics.patterns) == 2
     with pytest.raises(errors.IncompatibleSetupError, match=r"systematics: got .*nowhere"):
-        check_settings(dr.DiffrenderSettings(systematics=tmp_path / "nowhere"))
+        dr.DiffrenderSettings(systematics=tmp_path / "nowhere")
 
 
 @pytest.mark.slow
@@ -381,6 +415,147 @@ def test_a_rough_fit_tells_which_pixels_a_frame_shows(shown, caplog):
     assert choice.science[0].first_pixel == (PLACE if shown else None)
     assert ("is not seen in them; it is not used" in caplog.text) == (shown == 0)
     assert choice.settings is ALIGNED
+
+
+# A pattern that is given has to be one that could have been chosen.
+
+
+@cache
+def given():
+    """The library's pattern of these pixels, as it is in the products of a reduction."""
+    return dr.known_systematics(frame("TARGET", SAME_FLAT))
+
+
+WRONG = [
+    ({"TARGPROP": "hip 17695"}, {}, "was learned from frames of hip 17695, the star of"),
+    # Another programme may call it by another name.
+    (
+        {"TARGPROP": "M dwarf 3", "TARG_RA": 56.8473, "TARG_DEC": -1.9722}, {},
+        "learned from frames of M dwarf 3, .*: its planets are part of the pattern",
+    ),
+    ({"CORONMSK": "MASKA430R"}, {}, "with the mask MASK335R, .* has the mask MASK430R"),
+    ({"DETECTOR": "NRCA2"}, {}, "with the detector NRCALONG, .* has the detector NRCA2"),
+    ({}, {"filter": "F356W"}, "with the filter F444W, .* has the filter F356W"),
+    ({}, {"first_pixel": (100, 1600)}, r"none of the pixels .* from \(100, 1600\) on"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("cards", "changes", "message"), WRONG)
+def test_a_pattern_that_could_not_have_been_chosen_is_refused(cards, changes, message, tmp_path):
+    """Before any work, and alike wherever it is given; also one that was written and read."""
+    one, two = (
+        replace(each, **changes, header=fits.Header({**each.header, **cards}))
+        for each in rolls(SAME_FLAT)
+    )
+    systematics = dr.Systematics.read(given().write(tmp_path / "systematics.fits"))
+    with pytest.raises(errors.IncompatibleSetupError, match=message):
+        dr.refine(model(), [one, two], COARSE, systematics=systematics)
+    options = ReduceOptions(size=SIZE, systematics=tmp_path / "systematics.fits")
+    with pytest.raises(errors.IncompatibleSetupError, match=message):
+        prepare(dr.Sequence(one.target, (one, two)), COARSE, options, model=model())
+    settings = dr.DiffrenderSettings(model=model(), systematics=systematics)
+    with pytest.raises(errors.IncompatibleSetupError, match=message):
+        subtract_by_refinement(one, COARSE, settings)
+
+
+def test_what_a_pattern_does_not_say_is_a_remark(tmp_path, caplog):
+    """Files of earlier versions name their stars, and neither their places nor the flat field."""
+    path = given().write(tmp_path / "systematics.fits")
+    with fits.open(path, mode="update") as hdus:
+        for card in ("DETECTOR", "R_FLAT", "CATALOG"):
+            del hdus["PATTERN"].header[card]
+    old = dr.Systematics.read(path)
+    assert [star.names for star in old.stars] == [("HIP17695",), ("G-7-34",)]
+    missing = "do not say it: detector, flat field"
+    first, second = rolls(SAME_FLAT)
+    assert missing in caveat(old, first)
+    assert caveat(given(), first) == ""
+    # The pattern reaches 9 of 32 columns.
+    aside = replace(first, first_pixel=(PLACE[0] + 47, PLACE[1]))
+    assert caveat(given(), aside) == "covers 28 % of the pixels"
+    sequence = dr.Sequence("TARGET", (first, second))
+    begun = prepare(sequence, COARSE, ReduceOptions(size=SIZE, systematics=old), model=model())
+    assert missing in caplog.text
+    assert begun.options.systematics is old
+    same = replace(first, header=fits.Header({**first.header, "TARGPROP": "G 7-34"}))
+    with pytest.raises(errors.IncompatibleSetupError, match="learned from frames of G 7-34"):
+        prepare(dr.Sequence("G 7-34", (same,)), COARSE, begun.options, model=model())
+    caplog.clear()
+    foreign = dr.PatternLibrary((measured("A", filter="F356W"),))
+    prepare(sequence, COARSE, ReduceOptions(size=SIZE, systematics=foreign), model=model())
+    assert "none of the 1 patterns that were given" in caplog.text
+
+
+@pytest.mark.parametrize(("cards", "fitted"), [(SAME_FLAT, 1), (LIBRARY, 1), (OTHER_FLAT, 0)])
+def test_a_pattern_that_is_given_and_not_seen_is_refused(cards, fitted):
+    """Before the fit where the frames name another flat field than the pattern."""
+    count = []
+
+    def fit(choice, again):
+        count.append(again)
+        systematics = choice.systematics
+        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, systematics=systematics)
+
+    arguments = {"settings": ALIGNED, "systematics": given()}
+    message = "shows less than half of the pattern 'HIP17695, G-7-34'. .*_0465.fits"
+    with pytest.raises(errors.IncompatibleSetupError, match=message):
+        dr.pattern.fit_with_pattern(rolls(cards, shown=0.0), (), model(), COARSE, fit, **arguments)
+    assert len(count) == fitted
+    shown = rolls(cards)
+    choice, _ = dr.pattern.fit_with_pattern(shown, (), model(), COARSE, fit, **arguments)
+    assert choice.systematics is given()
+    # Only one of two rolls has another flat field.
+    if cards == OTHER_FLAT:
+        mixed = [rolls(SAME_FLAT)[0], rolls(cards, shown=0.0)[1]]
+        with pytest.raises(errors.IncompatibleSetupError, match=message):
+            dr.pattern.fit_with_pattern(mixed, (), model(), COARSE, fit, **arguments)
+        assert len(count) == 1
+
+
+def test_frames_are_moved_onto_the_pixels_of_a_pattern_that_is_given():
+    lost, bare = (replace(frame("TARGET", LIBRARY, shown=k), first_pixel=None) for k in (1.0, 0.0))
+    arguments = {"settings": ALIGNED, "systematics": given()}
+    chosen = choose_systematics([lost], [], model(), COARSE, **arguments)
+    assert chosen.science[0].first_pixel == PLACE
+    with pytest.raises(errors.IncompatibleSetupError, match="is not seen in these frames"):
+        choose_systematics([bare], [], model(), COARSE, **arguments)
+
+
+def test_products_in_place_of_other_files_are_named(tmp_path):
+    """The same thing is said wherever they are given."""
+    (roll,) = (frame("TARGET", {**SAME_FLAT, "EXP_TYPE": "NRC_CORON"}),)
+    fit = dr.refine(model(), roll, COARSE, settings=ALIGNED)
+    known = dr.PatternLibrary((measured("A"),))
+    products = {
+        "a fit": fit.write(tmp_path / "fit.fits"),
+        "a search": dr.detect(fit).write(tmp_path)[0],
+        "a flat-field pattern": given().write(tmp_path / "systematics.fits"),
+        "a library of flat-field patterns": known.write(tmp_path / "library.fits"),
+    }
+    for what, path in products.items():
+        words = f"{path.name}: this is no wavefront map, but {what}, a product of pyklip_diffrender"
+        with pytest.raises(errors.CorruptFileError, match=words):
+            dr.read_opd(path)
+        words = f"{path.name}: it is {what}, a product of pyklip_diffrender; expected frames"
+        with pytest.raises(errors.NoValidPixelsError, match=words):
+            dr.Sequence.from_files(path)
+        if "pattern" in what:
+            assert as_request(path) is not None
+            continue
+        with pytest.raises(errors.CorruptFileError, match=f"this is {what}, expected a flat-fie"):
+            as_request(path)
+
+
+def test_patterns_of_several_flat_fields_and_set_ups_are_not_averaged():
+    for name, value in {"flat": "old.fits", "detector": "NRCA2", "image_mask": "MASK430R"}.items():
+        with pytest.raises(errors.IncompatibleSetupError, match=value):
+            combine_patterns([measured("A"), measured("B", **{name: value})])
+        both = combine_patterns([measured("A"), measured("B", **{name: None})])
+        assert getattr(both, name) is None
+    # Of reference stars and a library, the flat field of the frames decides.
+    fit = dr.refine(model(), rolls(OTHER_FLAT), COARSE, settings=ALIGNED)
+    for cards, stars in ((OTHER_FLAT, ["TARGET"]), (SAME_FLAT, ["HIP17695", "G-7-34"])):
+        assert dr.known_systematics(frame("NEW", cards), fit).provenance["stars"] == stars
 
 
 @pytest.mark.parametrize(

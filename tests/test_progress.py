@@ -1,6 +1,5 @@
 """Progress: what a terminal shows, and what goes to the log."""
 
-import itertools
 import logging
 
 from pyklip_diffrender.io import ProgressBar, progress, stage
@@ -54,32 +53,4 @@ def test_the_log_gets_stages_and_at_most_a_line_a_minute(caplog, monkeypatch):
     assert [record.getMessage() for record in caplog.records] == [
         "1. place on the detector", "2. wavefront", "2. wavefront, chi2 3, step 3",
         "2. wavefront, chi2 3, step 6", "2. wavefront, chi2 3, step 9",
-    ]  # fmt: skip
-
-
-def test_the_time_that_is_left_follows_the_stages_that_have_ended(caplog, monkeypatch):
-    now, ticks = 1000.0, itertools.count(0, 1e-3)
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now + next(ticks))
-    caplog.set_level(logging.INFO)
-    with numbered_stages({"wavefront": 61.0, "search": 30.0, "products": 10.0}):
-        with stage("a look at the frames"):
-            pass
-        with stage("wavefront"), ProgressBar("x", shown=False) as bar:
-            now += 60.0
-            bar.update()
-            now += 120.0
-            bar.update()
-        # A stage that nobody expected does not count.
-        with stage("another fit"):
-            now += 500.0
-        # The first stage took three times as long as expected, so the others will.
-        with stage("search"):
-            now += 90.0
-        with stage("products"):
-            pass
-    assert [record.getMessage() for record in caplog.records] == [
-        "1. a look at the frames, about 2 min left", "2. wavefront, about 2 min left",
-        "2. wavefront, about 41 s left, step 1", "2. wavefront, more than 2 min left, step 2",
-        "3. another fit, about 2 min left", "4. search, about 2 min left",
-        "5. products, about 30 s left",
     ]  # fmt: skip

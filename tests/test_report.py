@@ -30,6 +30,7 @@ from pyklip_diffrender.reduction.pipeline import looks_extended
 from pyklip_diffrender.reduction.products import page
 from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import Status
+from pyklip_diffrender.scene.product_headers import world_coordinates
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)
 ROLL = 30.0
@@ -93,10 +94,26 @@ def test_products_of_another_reduction_are_removed(folder):
 def test_no_writer_replaces_a_file_without_being_asked(tmp_path, write, name):
     path = tmp_path / name
     path.write_text("earlier", encoding="utf-8")
-    with pytest.raises(OSError, match=rf"{re.escape(name)} exists.*overwrite=True"):
+    with pytest.raises(OSError, match=rf"{re.escape(name)} exists.*option overwrite"):
         write(reduction(), path)
     assert [each.name for each in tmp_path.iterdir()] == [name]
     assert path.read_text(encoding="utf-8") == "earlier"
+
+
+@pytest.mark.parametrize("value", ["N/A", "half an hour", True, None, 1234.5, 1234])
+def test_a_card_that_is_only_told_does_not_end_a_reduction(value):
+    whole = reduction()
+    (frame,) = whole.sequence.science
+    cards = {"EFFEXPTM": value, "PROGRAM": 1184, "CORONMSK": None, "CRVAL1": 100, "RADESYS": None}
+    odd = replace(frame, header=fits.Header({**frame.header, **cards}))
+    summary = summarise(replace(whole, sequence=replace(whole.sequence, science=(odd,))))
+    known = value if isinstance(value, int | float) and value is not True else None
+    assert summary["exposure_s"] == summary["frames"][0]["exposure_s"] == known
+    assert (summary["program"], summary["image_mask"]) == ("1184", None)
+    json.dumps(summary, allow_nan=False)
+    # A coordinate that is a whole number is one.
+    wcs = world_coordinates(whole.fit.frames[0].grid, odd)
+    assert (wcs["CRVAL1"], wcs["CTYPE1"], wcs["RADESYS"]) == (100.0, "RA---TAN", "ICRS")
 
 
 def test_the_first_sentence_has_the_numbers_of_the_planet():
@@ -159,7 +176,7 @@ def test_candidates_in_line_suggest_a_disk():
     three = replace(Candidates.at(places, np.full(3, 1e-5)), detection_errors=errors)
     detection = replace(whole.detection, sources=three, false_alarm=np.zeros(3))
     crowded = replace(whole, detection=detection)
-    suggestion = "repeat the reduction with disk=True (--disk on the command line)"
+    suggestion = "repeat the reduction with the option disk"
     assert len(crowded.detection.candidates) == 3
     assert str(crowded).endswith(f"{suggestion}.")
     assert suggestion in crowded._repr_html_()

@@ -238,7 +238,7 @@ def test_the_stars_flux_may_be_given_in_any_unit(star):
 
 @pytest.mark.parametrize("star", [0, math.nan, "bright", 3 * u.m, None, [0.1, 0.2]])
 def test_what_is_no_flux_is_refused(star):
-    with pytest.raises(IncompatibleSetupError, match=r"star_flux: got .* expected a"):
+    with pytest.raises(IncompatibleSetupError, match=r"star_flux: got .* expected (a flux|1e-06)"):
         to_jansky(star)
 
 

@@ -10,9 +10,9 @@ import torch
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
 from small_files import calints as small_calints
-from synthetic_searches import searched
 
 from benchmarks.calints_files import calints
+from benchmarks.synthetic_searches import searched
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Candidates, Detection
 from pyklip_diffrender.detection.error_factor import ErrorFactor
@@ -151,6 +151,28 @@ def test_products_have_spaceklips_keywords_and_curves(tmp_path):
     again = Table.read(tmp_path / "x.dat", format="ascii")
     assert list(again["FITSFILE"]) == list(table["FITSFILE"])
     assert again["ALIGN_SHIFT"][0] == "[[0.0, 0.0]]"
+
+
+def test_columns_that_hold_no_value_end_nothing_after_the_fit(tmp_path):
+    """SpaceKLIP copies cards as they are: None, text in place of a number, or masked."""
+    path = frame(tmp_path / "a_calints.fits", np.ones((SIDE, SIDE)), 63.0)
+    with fits.open(path, mode="update") as hdus:
+        del hdus["SCI"].header["CRVAL1"]
+    odd = {"TARG_RA": None, "CWAVEL": "N/A", "EXPSTART": None, "NINTS": "two", "PIXSCALE": "",
+           "EFFINTTM": True, "MASKFILE": None, "BUNIT": b"MJy/sr", "TARGPROP": "β Pic"}  # fmt: skip
+    table = concatenation([path], **odd)
+    table["DWAVEL"] = np.ma.masked_array([1.0], mask=[True])
+    table.remove_column("APERNAME")
+    product = tmp_path / "x-KLmodes-all.fits"
+    fits.writeto(product, np.zeros((1, SIDE, SIDE)), fits.Header({"PSFCENTX": 20, "PSFCENTY": 20}))
+    database_files.complete_header(product, table, "ADI")
+    database_files.write_database(tmp_path / "x.dat", table)
+    database_files.write_mask(tmp_path / "x_psfmask.fits", table)
+    header = fits.getheader(product)
+    assert (header["CWAVEL"], header["TARGPROP"], header["NINTS"]) == ("N/A", "? Pic", 0)
+    assert not {"TARG_RA", "DWAVEL", "EXPSTART", "APERNAME", "CRVAL2"} & set(header)
+    assert not (tmp_path / "x_psfmask.fits").exists()
+    assert Table.read(tmp_path / "x.dat", format="ascii")["CWAVEL"][0] == "N/A"
 
 
 def test_a_failure_is_reported_after_the_others(tmp_path, monkeypatch, caplog):
@@ -319,9 +341,28 @@ def test_a_concatenation_from_frames_to_sources(kind, tmp_path, request):
 
 def test_a_flux_of_no_filter_is_refused(tmp_path):
     database = StandIn(tmp_path, {KEY: concatenation(["one_calints.fits"])})
-    for flux, words in (({"F335M": 0.4}, r"'F335M'.*\['F444W'\]"), ({"F444W": -0.4}, "positive")):
+    for flux, words in (
+        ({"F335M": 0.4}, r"'F335M'.*\['F444W'\]"),
+        ({"F444W": -0.4}, "expected 1e-06"),
+    ):
         with pytest.raises(IncompatibleSetupError, match=words):
             spaceklip.run_obs(database, opd=OPD, star_flux=flux)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"fit_pixel": 80}, TypeError, "unexpected keyword argument 'fit_pixel'"),
+        ({"model_options": {"npx": 8}}, IncompatibleSetupError, "npx: not known to nircam_cor"),
+        ({"systematics": "no.fits"}, IncompatibleSetupError, "systematics: got 'no.fits'"),
+        ({"threshold": 0.0}, IncompatibleSetupError, "threshold: got 0.0"),
+    ],
+)
+def test_settings_are_checked_before_the_first_file_is_read(settings, error, message, tmp_path):
+    database = StandIn(tmp_path, {KEY: concatenation(["missing_calints.fits"])})
+    with pytest.raises(error, match=message):
+        spaceklip.run_obs(database, opd=OPD, **settings)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

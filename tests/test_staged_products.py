@@ -1,19 +1,19 @@
-"""Products that are written as they come, and reductions that are resumed."""
+"""Products that are written as they come, beside those of other runs."""
 
 import copy
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
-from astropy.table import QTable
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.errors import CorruptFileError, ExistingFileError, IncompatibleSetupError
+from pyklip_diffrender.errors import DiffrenderWarning, ExistingFileError, IncompatibleSetupError
+from pyklip_diffrender.io.files import OutputFolder
 from pyklip_diffrender.reduction import (
-    UNFINISHED,
     Preparation,
     ProductFolder,
     ReduceOptions,
@@ -42,81 +42,115 @@ def preparation(**options):
     return Preparation(sequence, sequence, model, opd, chosen, chosen.settings)
 
 
-INJECTED = QTable(
-    {
-        "separation": [0.4, 0.6] * u.arcsec, "position_angle": [10.0, 200.0] * u.deg,
-        "injected": [1e-5, 1e-5], "contrast": [1.1e-5, 0.9e-5], "contrast_error": [1e-6, 1e-6],
-        "snr": [8.0, 7.0], "detected": [True, True],
-    },
-    meta={"strength": 1.6},
-)  # fmt: skip
-
-
 def interrupted(*_, **__):
     raise KeyboardInterrupt
 
 
+class Remembering(ProductFolder):
+    """The folder of the products, and the reductions that were written to it."""
+
+    kept = ()
+
+    def keep(self, reduction):
+        self.kept += (reduction,)
+        return super().keep(reduction)
+
+
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """A reduction that was interrupted while planets were injected."""
-    prepared, folder = preparation(), tmp_path_factory.mktemp("products")
+    """A reduction that was interrupted while planets were injected, and its folder."""
+    products = Remembering(tmp_path_factory.mktemp("products"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "recover_planets", interrupted)
         patch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"no picture")
         with pytest.raises(KeyboardInterrupt):
-            prepared.run(products=ProductFolder(folder))
-    return prepared, folder
+            preparation().run(products=products)
+    (reduction,) = products.kept
+    return reduction, products.folder
 
 
 def test_an_interrupted_reduction_leaves_fit_and_search(stopped):
     _, folder = stopped
     names = {path.name for path in folder.iterdir()}
-    assert {"report.html", "summary.json", "fit.fits", "detection.fits", UNFINISHED} <= names
+    assert {"report.html", "summary.json", "fit.fits", "detection.fits"} <= names
     assert "injections.ecsv" not in names
+    assert not [name for name in names if name.startswith(".")]
     assert len(dr.Detection.read(folder).candidates) == 1
+    # Nothing of it has to be kept for later: the derivatives are there if they are asked for.
+    assert dr.Refinement.read(folder / "fit.fits").stored_linear is None
     with pytest.raises(ExistingFileError, match="overwrite"):
         ProductFolder(folder)
 
 
+def content(folder):
+    """Content of all files in a folder, and in those inside."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
 @pytest.mark.slow
-def test_a_resumed_reduction_does_not_fit_again(stopped, tmp_path, monkeypatch):
-    prepared, before = stopped
-    for path in before.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    found = dr.Detection.read(tmp_path).candidates
-    monkeypatch.setattr(pipeline, "refine", interrupted)
-    monkeypatch.setattr(pipeline, "detect", interrupted)
-    monkeypatch.setattr(pipeline, "recover_planets", lambda *_: INJECTED)
-    products = ProductFolder(tmp_path, resume=True)
-    # Options of later stages may change.
-    options = replace(prepared.options, memory="3 GB")
-    result = replace(prepared, options=options).run(products=products)
-    written = products.finish(result)
-    np.testing.assert_array_equal(result.detection.candidates["snr"], found["snr"])
-    assert tmp_path / "injections.ecsv" in written
-    assert not (tmp_path / UNFINISHED).exists()
-    assert json.loads((tmp_path / "summary.json").read_text())["injections"]["count"] == 2
-    # The derivatives were for the resumed reduction only.
-    assert dr.Refinement.read(tmp_path / "fit.fits").stored_linear is None
+def test_products_of_another_run_are_kept(stopped, tmp_path, monkeypatch):
+    """One run has ended, a second begins, a third begins and ends, and the second ends."""
+    monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"no picture")
+    reduction, first = stopped
+    shutil.copytree(first, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "notes.txt").write_text("mine")
+    second = ProductFolder(tmp_path, overwrite=True)
+    third = ProductFolder(tmp_path, overwrite=True)
+    third.keep(replace(reduction, accuracy="quick"))
+    assert third.folder == tmp_path
+    before = content(tmp_path)
+    assert json.loads(before["summary.json"])["accuracy"] == "quick"
+    aside = tmp_path / f"{tmp_path.name}-2"
+    with pytest.warns(DiffrenderWarning, match=rf"kept, and .* of this run are in {aside}"):
+        written = second.keep(reduction)
+    assert written
+    assert {path.parent for path in written} == {aside}
+    inside = {f"{aside.name}/{path.name}": path.read_bytes() for path in written}
+    assert content(tmp_path) == before | inside
+    assert json.loads((aside / "summary.json").read_text())["accuracy"] == "full"
 
 
-def test_another_reduction_is_not_resumed(stopped, tmp_path):
-    prepared, folder = stopped
-    for changed in (
-        replace(prepared, options=replace(prepared.options, threshold=4.0)),
-        replace(prepared, wavefront=dr.random_opd(2, npix=128)),
-    ):
-        with pytest.raises(IncompatibleSetupError, match="other frames, with other options"):
-            changed.run(products=ProductFolder(folder, resume=True))
-    (tmp_path / UNFINISHED).write_text('{"version": 1}')
-    with pytest.raises(CorruptFileError, match=r"is damaged.*--overwrite"):
-        prepared.run(products=ProductFolder(tmp_path, resume=True))
-    with pytest.raises(TypeError, match="without output"):
-        dr.reduce(prepared.sequence, prepared.wavefront, resume=True)
+def test_without_overwrite_products_of_another_run_are_kept_as_well(tmp_path):
+    def files(folder):
+        return [folder / name for name in ("a.txt", "b.txt")]
+
+    def writing(text, names=("a.txt", "b.txt")):
+        def write(folder):
+            for name in names:
+                (folder / name).write_text(text)
+            return [folder / name for name in names]
+
+        return write
+
+    runs = [OutputFolder(tmp_path / "out", files, overwrite=False) for _ in range(3)]
+    assert runs[0].replace(writing("first")) == files(tmp_path / "out")
+    for number, run in enumerate(runs[1:], 2):
+        with pytest.warns(DiffrenderWarning, match="somebody else has written"):
+            assert run.replace(writing(str(number))) == files(tmp_path / "out" / f"out-{number}")
+        # Products of the next stages belong there as well.
+        assert run.replace(writing("again")) == files(tmp_path / "out" / f"out-{number}")
+    assert {path.read_text() for path in files(tmp_path / "out")} == {"first"}
+    with pytest.raises(IncompatibleSetupError, match=r"a\.txt is a file, expected a folder"):
+        OutputFolder(tmp_path / "out" / "a.txt", files, overwrite=True)
+    with pytest.raises(ExistingFileError, match=r"a\.txt, .*b\.txt exist"):
+        OutputFolder(tmp_path / "out", files, overwrite=False)
+    # What the new products do not have is removed, but not where somebody has changed it.
+    last = OutputFolder(tmp_path / "out", files, overwrite=True)
+    assert last.replace(writing("last", ["a.txt"])) == [tmp_path / "out" / "a.txt"]
+    assert not (tmp_path / "out" / "b.txt").exists()
+    # Products that cannot be written leave the earlier ones as they are.
+    before = content(tmp_path)
+    with pytest.raises(ZeroDivisionError):
+        last.replace(lambda folder: [(folder / "a.txt").write_text("half"), 1 / 0])
+    assert content(tmp_path) == before
+    (tmp_path / "out" / "a.txt").write_text("by hand")
+    last.clear()
+    assert (tmp_path / "out" / "a.txt").read_text() == "by hand"
 
 
 def test_a_detection_in_terms_of_astropy(stopped):
-    prepared, folder = stopped
+    reduction, folder = stopped
     detection = dr.Detection.read(folder)
     (place,) = detection.coordinates
     star = place.__class__(POINTING["CRVAL1"], POINTING["CRVAL2"], unit="deg")
@@ -135,7 +169,7 @@ def test_a_detection_in_terms_of_astropy(stopped):
     assert subtracted.unit == u.photon
     with pytest.raises(IncompatibleSetupError, match="a frame below 1"):
         detection.to_ccddata("subtracted", frame=1)
-    frame = prepared.sequence.science[0]
+    frame = reduction.sequence.science[0]
     np.testing.assert_array_equal(frame.mask, ~frame.valid)
     blind = copy.copy(detection)
     vars(blind)["observation"] = replace(detection.observation, header=fits.Header())

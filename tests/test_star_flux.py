@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import QTable
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import measured_planet
@@ -100,6 +100,65 @@ def test_contrasts_refer_to_the_catalogues_star(fit, tmp_path):
     assert (again.catalogue_flux, again.catalogue_error) == (stated, 0.05)
 
 
+def test_a_flux_that_cannot_be_the_stars_is_refused(fit):
+    """A number in another unit, or of another star; before the fit with that flux."""
+    fit, _ = with_header(fit, fits.Header({"INSTRUME": "NIRCAM", "PIXAR_SR": 9.2e-19}))
+    seen = jansky_per_unit(fit.frames[0]) * fit.frames[0].flux
+    # F_nu = F_lambda lambda^2 / c, in W / m2 / Hz and W / m2 / m.
+    flam = seen * 1e-26 * 2.99792458e8 / 4.5e-6**2 * 1e-6
+    magnitude = -2.5 * math.log10(seen / 3631)
+    cases = ((1000 * seen, "mJy"), (1e6 * seen, "uJy"), (flam, "W / (um m2)"), (magnitude, "mag"))
+    for stated, unit in cases:
+        with pytest.raises(IncompatibleSetupError) as raised:
+            with_star_flux(fit, stated, 0.05)
+        message = str(raised.value)
+        assert f"got {stated:.3g} Jy, expected about {seen:.3g} Jy (to 10 %)" in message
+        assert f"{stated:.3g} {unit}" in message
+        assert f"would be {seen:.3g} Jy" in message
+    flat = replace(fit, initial=as_opd_map("flat"))
+    for factor in (3.4, 1 / 3.4, 12.0):
+        with pytest.raises(IncompatibleSetupError) as raised:
+            with_star_flux(fit, factor * seen, 0.05)
+        assert "would be" not in str(raised.value)
+    # From a flat wavefront the star's flux is uncertain by 40 %.
+    with pytest.raises(IncompatibleSetupError, match=r"\(to 40 %\)"):
+        with_star_flux(flat, 4.3 * seen, 0.05)
+    # One that the fit did not correct says even less.
+    lost = replace(flat, status=dr.Status.MODEL_MISMATCH)
+    with pytest.raises(IncompatibleSetupError, match=r"\(to 40 %\)"):
+        with_star_flux(lost, 13.0 * seen, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("factor", "map_", "status"),
+    [(3.2, True, "CONVERGED"), (1 / 4.1, False, "CONVERGED"), (1 / 12, False, "MODEL_MISMATCH")],
+)
+def test_a_flux_within_a_factor_of_three_is_taken(fit, factor, map_, status):
+    """With the error of the fitted one: 10 % with a map, and 40 % without one."""
+    start = replace(fit, status=dr.Status[status])
+    start = start if map_ else replace(start, initial=as_opd_map("flat"))
+    short = replace(start, settings=replace(start.settings, max_iterations=1, wavefront=False))
+    seen = jansky_per_unit(fit.frames[0]) * fit.frames[0].flux
+    assert with_star_flux(short, factor * seen, 0.05, held=1e-9).catalogue_flux == factor * seen
+
+
+def test_a_reduction_finds_a_mistaken_unit_before_the_wavefront_is_fitted(fit, caplog):
+    cards = {"INSTRUME": "NIRCAM", "PIXAR_SR": 9.2e-19, "CORONMSK": "MASKA335R"}
+    fit, frame = with_header(fit, fits.Header(cards))
+    sequence = dr.Sequence("A STAR", (frame,))
+    seen = jansky_per_unit(fit.frames[0]) * fit.frames[0].flux
+    caplog.set_level("INFO")
+    for factor, stages in ((1000, []), (5, ["1. wavefront"])):
+        options = ReduceOptions(
+            star_flux=factor * seen, systematics="off", settings=dr.GaussNewton(cycles=6)
+        )
+        with pytest.raises(IncompatibleSetupError, match=r"star_flux: got"):
+            prepare(sequence, fit.initial, options, model=fit.model).run()
+        begun = [each.getMessage() for each in caplog.records if each.name.endswith("progress")]
+        assert [text for text in begun if "wavefront" in text or "search" in text] == stages
+        caplog.clear()
+
+
 def test_frames_without_calibration_are_refused_before_the_fit(fit):
     bare, observation = with_header(fit, fits.Header({"INSTRUME": "NIRCAM"}))
     with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
@@ -155,7 +214,7 @@ def as_photometry(path):
     bands = np.repeat([1.66, 2.16, 3.35, 4.60, 11.6], 3) * u.micron
     # Two catalogues agree, and the third is wrong: the median is that of the two.
     flux = rayleigh_jeans(bands).value * np.tile([1.0, 1.0, 3.0], 5)
-    table = Table({"sed_freq": bands.to(u.GHz, u.spectral()).value, "sed_flux": flux})
+    table = QTable({"sed_freq": bands.to(u.GHz, u.spectral()), "sed_flux": flux * u.Jy})
     table.write(path, format="votable")
 
 
@@ -174,7 +233,7 @@ def test_power_law_in_every_format(tmp_path, write, kind, filter):
 @pytest.mark.parametrize(
     ("text", "expected", "complaint"),
     [
-        ("<html>no</html>", CorruptFileError, "wavelength in micron and flux density in Jy"),
+        ("<html>no</html>", CorruptFileError, "not a table of numbers"),
         ("3.0 -1\n4.0 nan\n5.0 0.5\n", CorruptFileError, "1 of 3 samples"),
         ("0.5 1.0\n1.5 0.5\n2.2 0.3\n", IncompatibleSetupError, r"covers 0\.500 to 2\.200 micron"),
         (

@@ -14,11 +14,11 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
 from survey_stubs import HOSTILE, Tags, configuration, inputs, result, stub
-from synthetic_searches import searched, write_searched
 
 import pyklip_diffrender as dr
 from benchmarks import faults
 from benchmarks.calints_files import CENTER, SIDE, calints
+from benchmarks.synthetic_searches import searched, write_searched
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.surveys import execution
@@ -117,6 +117,7 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
         ((), "combined", {"spectra": []}, ["combined: spectra", "[]"]),
         ((), "combined", {"parallax": 0.1}, ["combined: got the key 'parallax'", "spectra"]),
         ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
+        ((), "injections", {"contrasts": [12.5]}, ["contrasts", "no magnitudes"]),
         ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
         ((0,), "files", "nowhere.fits", ["sequence 1: files", "nowhere.fits", "exist"]),
         ((0,), "opd", 3, ["sequence 1: opd", "3", "map"]),
@@ -124,6 +125,7 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
         ((1,), "name", "two\nlines", ["sequence 2: name", "printable"]),
         ((1,), "size", 4, ["sequence 2: size", "8 or more"]),
         ((1,), "threshold", 10**400, ["sequence 2: threshold", "positive"]),
+        ((1,), "systematics", __file__, ["sequence 2: systematics", "test_survey", "patterns"]),
         ((1,), "systematics", "no.fits", ["sequence 2: systematics", "'no.fits'", "references"]),
         ((1,), "injections", {**PLANETS, "separations": [2.0]}, ["sequence 2", "less than 1.3"]),
         ((1,), "code", "import os", ["sequence 2: got the key 'code'", "one of files"]),
@@ -234,6 +236,13 @@ def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path, monk
     star, flat = others[-2:]
     assert (star.options.star_flux, star.options.star_flux_error) == (0.4, 0.05)
     assert (flat.opd, list(flat.inputs)) == ("flat", [plain["files"]])
+    # Where reference stars may join the target's fit, memory decides how many of them do.
+    limits = ({"memory_limit": each} for each in ("4 GB", "4000 MB", "8 GB"))
+    less, same, more = (planned({**config, **each})[0].key for each in limits)
+    assert less == same
+    assert len({job.key, less, more}) == 3
+    alone = {**config, "sequence": [{**plain, "references": "off"}]}
+    assert len({planned({**alone, **each})[0].key for each in ({}, {"memory_limit": "4 GB"})}) == 1
     of_all = planned({**config, "options": {"disk": True}})
     assert [each.options.disk for each in of_all] == [True]
     Path(plain["opd"]).write_bytes(b"another map")
@@ -263,6 +272,56 @@ def test_finished_jobs_are_not_run_again(tmp_path):
     # The job of the old content stays.
     assert len(list((output / "jobs").iterdir())) == 4
     assert hidden(output) == []
+
+
+@pytest.mark.parametrize("change", ["roll", "date", "star"])
+def test_another_content_of_the_frames_is_another_job(tmp_path, caplog, change):
+    """Corrected headers, and frames of another star under the name of the finished ones."""
+    config, output, path = inputs(tmp_path, 1), tmp_path / "out", tmp_path / "frames.fits"
+    config["sequence"][0] |= {"files": str(path), "name": "first"}
+    calints(path, roll=70.0)
+    ran = []
+
+    def work(job, folder):
+        ran.append(job.key)
+        return stub(job, folder)
+
+    (before,) = run_survey(config, output, work)["folder"]
+    assert "done again" not in caplog.text
+    if change == "star":
+        path.unlink()
+        calints(path, "HD 2", roll=70.0)
+    else:
+        card, value = {"roll": ("ROLL_REF", 71.0), "date": ("DATE-BEG", "2022-10-05T06:00:00")}[
+            change
+        ]
+        fits.setval(path, card, value=value, ext=int(change == "roll"))
+    (after,) = run_survey(config, output, work)["folder"]
+    assert "1 jobs are done again" in caplog.text
+    assert before != after
+    assert len(set(ran)) == 2
+    # The folder of the first job stays, and is that of a job with these frames only.
+    assert {path.name for path in (output / "jobs").iterdir()} == {before, after}
+
+
+def test_products_of_another_job_are_not_those_of_this_one(tmp_path, caplog):
+    config, output = inputs(tmp_path / "data", 2), tmp_path / "out"
+    first, second = run_survey(config, output, stub)["folder"]
+    shutil.rmtree(output / "jobs" / first)
+    shutil.copytree(output / "jobs" / second, output / "jobs" / first)
+    ran = []
+
+    def work(job, folder):
+        ran.append(job.name)
+        return stub(job, folder)
+
+    table = run_survey(config, output, work)
+    assert ran == ["star0_calints"]
+    assert "are done again" in caplog.text
+    assert "star0_calints" in caplog.text
+    assert list(table["folder"]) == [first, second]
+    record = json.loads((output / "jobs" / first / "job.json").read_text())
+    assert record["job"]["name"] == "star0_calints"
 
 
 def test_a_failure_is_a_row_and_is_tried_again(tmp_path):
@@ -435,6 +494,10 @@ def test_a_combined_search_is_kept_until_its_jobs_or_spectra_change(tmp_path, ca
     assert combined(first) == before
     assert page.read_text() == "kept"
     assert caplog.text.count("combined search of") == 1
+    # A damaged one is made again.
+    page.with_name("comparison.json").write_text("{")
+    assert combined(first) == before
+    assert page.read_text() != "kept"
     flat = combined({**first, "combined": {"spectra": ["flat"]}})
     assert [each["name"] for each in flat["spectra"]] == ["flat"]
     assert not flat["free"]

@@ -18,6 +18,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.pattern import measure
 from pyklip_diffrender.refinement import Status, refine_again
 from pyklip_diffrender.scene import Observation, Planet, Systematics
+from pyklip_diffrender.scene.systematics import require_pattern_of
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
 
 NPIX, SIZE = 64, 32
@@ -65,10 +66,11 @@ def test_pixels_are_matched_on_the_detector_where_both_know_theirs(corner):
 def test_another_filter_and_unequal_arrays_are_refused():
     zeros = np.zeros((9, 12))
     known = Systematics(zeros, zeros, (6.0, 4.0), 0.5, filter="F444W")
-    known.at(frame((9, 12), (6.0, 4.0), filter="F444W"))
-    known.at(frame((9, 12), (6.0, 4.0)))  # Nothing says that they do not go together.
-    with pytest.raises(IncompatibleSetupError, match=r"F356W.*'systematics'.*F444W"):
-        known.at(frame((9, 12), (6.0, 4.0), filter="F356W"))
+    require_pattern_of(known, frame((9, 12), (6.0, 4.0), filter="F444W"))
+    # Nothing says that they do not go together.
+    require_pattern_of(known, frame((9, 12), (6.0, 4.0)))
+    with pytest.raises(IncompatibleSetupError, match=r"'systematics'.*F444W.*F356W"):
+        require_pattern_of(known, frame((9, 12), (6.0, 4.0), filter="F356W"))
     with pytest.raises(ShapeError, match=r"\(9, 12\) and \(9, 11\)"):
         Systematics(zeros, zeros[:, 1:], (6.0, 4.0), 0.5)
 

@@ -10,10 +10,9 @@ from astropy.io import fits
 from astropy.time import Time
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.cli.reducing import steps_of
+from pyklip_diffrender.cli.reducing import describe_steps
 from pyklip_diffrender.detection import sources_of_references
 from pyklip_diffrender.detection.error_factor import structures_in_single_roll
-from pyklip_diffrender.errors import CorruptFileError, ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.pattern import (
     PatternLibrary,
     choose_systematics,
@@ -222,7 +221,7 @@ def test_frames_that_do_not_fit_into_the_memory_are_left_out(caplog):
     _, visit, _ = with_references(fit, choice, [reference(0), reference(1)], memory=memory)
     assert [each.use for each in visit.contributions] == ["wavefront", "not used"]
     assert "memory" in visit.contributions[1].reason
-    assert "--memory" in caplog.text
+    assert "GB of the option memory" in caplog.text
 
 
 @cache
@@ -270,6 +269,10 @@ def test_a_pattern_is_not_learned_twice_from_a_reference():
 
     assert pattern(origin="library") is not None
     assert pattern(origin="given") is choice.systematics
+    # One that was given and has the star of a reference frame is not of other stars.
+    learned = replace(choice.systematics, provenance={"stars": ["hd-2"]})
+    assert pattern(origin="given", systematics=learned).name == "the rolls themselves"
+    assert learned.name == "the rolls themselves"
     assert pattern(origin="off", systematics=None) is None
     elsewhere = [reference(0, first_pixel=(700, 1600))]
     assert pattern_for_visit(replace(choice, origin="none"), science()[:1], elsewhere) is None
@@ -294,7 +297,8 @@ TEACHING, TOGETHER = "reference star HD 2", "reference stars and target together
 def test_a_plan_has_what_reference_frames_are_used_for(near, far, options, planned):
     references = (*(reference(k) for k in range(near)), *(later(k) for k in range(far)))
     sequence = dr.Sequence("HD 1", science(), references)
-    names = [name for name, _ in steps_of(sequence, ReduceOptions(size=SIZE, **options))]
+    steps = describe_steps(sequence, ReduceOptions(size=SIZE, **options)).splitlines()
+    names = [each.partition(". ")[2] for each in steps]
     assert [name for name in names if name in (TEACHING, TOGETHER)] == planned
 
 
@@ -392,7 +396,7 @@ def test_references_of_other_epochs_teach_the_pattern_and_not_the_wavefront():
 @pytest.mark.parametrize(
     ("options", "count", "reason"),
     [
-        ({"references": "off"}, 2, "references is 'off' (--references)"),
+        ({"references": "off"}, 2, "the option references is 'off'"),
         ({"systematics": "off"}, 2, "another one, and systematics is 'off'"),
         ({}, 1, "another one, and there are too few frames for a pattern, two at least"),
     ],
@@ -409,6 +413,31 @@ def test_what_is_not_used_is_said_with_the_reason(options, count, reason, caplog
         assert [each["use"] for each in summary["frames"]] == ["target"] * 2 + [use] * count
         (page,) = {each["use"] for each in summary["visit"]["contributions"]}
         assert page == use
+
+
+def test_frames_of_several_flat_fields_do_not_share_a_pattern():
+    """The pattern is the error of one flat field."""
+
+    def calibrated(frames, *flats):
+        return [
+            replace(each, header=fits.Header({**each.header, "R_FLAT": f"crds://{flat}.fits"}))
+            for each, flat in zip(frames, flats, strict=True)
+        ]
+
+    same, other = (calibrated(science(), "a", flat) for flat in "ab")
+    chosen, without = (
+        choose_systematics(each, (), model(), OPD, settings=SETTINGS) for each in (same, other)
+    )
+    assert (chosen.origin, without.origin) == ("rolls", "none")
+    aligned = replace(SETTINGS, wavefront=False, free=("flux", "background"))
+    for frames, shared in ((same, True), (other, False)):
+        fit = refine(model(), frames, OPD, systematics=chosen.systematics, settings=aligned)
+        shares = [bool((part.common != 0).any()) for part in fit.linear.frames]
+        assert shares == [shared, shared]
+    # Frames of a reference star with the same pixels, but another flat field, do not take part.
+    (star,) = calibrated([reference(0)], "b")
+    assert pattern_for_visit(without, same[:1], [star]) is None
+    assert pattern_for_visit(without, same[:1], calibrated([star], "a")) is not None
 
 
 def test_exposure_sequences():
@@ -466,95 +495,3 @@ def test_a_single_roll_may_show_a_structure_of_the_detector():
     assert row["false_alarm_probability"] < 0.1 * structures
     assert "2 candidates in 12 real rolls" in single.remark
     assert both.remark == ""
-
-
-@cache
-def fitted_reference():
-    """The fit of three dithers of the reference star, from the map."""
-    frames = [replace(reference(k), reference=False) for k in range(3)]
-    choice = choose_systematics(frames, (), model(), OPD, settings=SETTINGS)
-    fit = refine(model(), frames, OPD, systematics=choice.systematics, settings=SETTINGS)
-    return dr.ReferenceStar.of(fit)
-
-
-def sequence(*references):
-    return dr.Sequence("HD 1", science(), references)
-
-
-def test_the_file_of_a_reference_star_is_a_map_and_a_library_of_patterns(tmp_path):
-    star = fitted_reference()
-    path = star.write(tmp_path / "reference.fits")
-    again = dr.ReferenceStar.read(path)
-    np.testing.assert_array_equal(again.wavefront.data, star.wavefront.data)
-    np.testing.assert_array_equal(dr.read_opd(path).data, star.wavefront.data)
-    assert again.wavefront.date == star.wavefront.date == reference(0).date
-    assert len(dr.PatternLibrary.read(path).patterns) == 3
-    for name in ("filter", "image_mask", "detector", "frames", "status", "start"):
-        assert getattr(again, name) == getattr(star, name)
-    assert again.star == star.star == "HD 2"
-    with pytest.raises(ExistingFileError):
-        star.write(path)
-    fits.writeto(tmp_path / "opd.fits", OPD.data, fits.Header({"BUNIT": "m"}))
-    with pytest.raises(CorruptFileError, match="no reference star in it"):
-        dr.ReferenceStar.read(tmp_path / "opd.fits")
-
-
-@pytest.mark.slow
-def test_a_reference_star_in_place_of_a_map_makes_limits_deeper():
-    star = fitted_reference()
-    begun = pipeline.prepare(sequence(reference(0), reference(4)), star, ReduceOptions(size=SIZE))
-    assert begun.wavefront is star.wavefront
-    # A frame that the star was fitted to is not used again.
-    assert [each.name for each in begun.sequence.references] == ["HD 2 8"]
-    pattern = begun.options.systematics
-    assert isinstance(pattern, dr.Systematics)
-    assert pattern.provenance["frames"] == list(star.frames)
-    settings = replace(SETTINGS, prior=replace(SETTINGS.prior, scales=begun.settings.prior.scales))
-    fit = refine(model(), science(), star.wavefront, systematics=pattern, settings=settings)
-    assert limit(fit) < limit(alone()[1]) / 1.05
-    candidate_of(dr.detect(fit))
-
-
-def test_settings_about_a_reference_star_are_those_of_the_options():
-    star = fitted_reference()
-    usual, begun = (
-        pipeline.prepare(sequence(), each, ReduceOptions(size=SIZE, accuracy="quick"))
-        for each in (OPD, star)
-    )
-    assert begun.settings.prior.scales["segment"] < 2
-    assert begun.settings.cycles == usual.settings.cycles
-    assert begun.settings.tolerance == usual.settings.tolerance
-    # Settings that are given are not changed; the pattern is used with them as well.
-    own = pipeline.prepare(sequence(), star, ReduceOptions(size=SIZE, settings=SETTINGS))
-    assert own.settings is SETTINGS
-    assert isinstance(own.options.systematics, dr.Systematics)
-
-
-def test_the_prior_about_a_reference_star_grows_with_the_days():
-    star = fitted_reference()
-    usual = GaussNewton.nircam("F444W").prior.scales["segment"]
-    dates = [star.wavefront.date + days * u.day for days in (0.1, 1.0, 5.0, 30.0)]
-    later = [star.settings_for(replace(science()[0], date=date)) for date in dates]
-    scales = [each.prior.scales["segment"] for each in later]
-    assert scales == sorted(scales)
-    # 2.7 nm within hours, and 9 nm after 3.6 days.
-    assert scales[2] / scales[0] == pytest.approx((2.7 + 5 * 1.75) / (2.7 + 0.1 * 1.75))
-    assert scales[-1] == usual
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"filter": "F356W"}, "got the filter F356W, expected F444W"),
-        ({"header": {"CORONMSK": "MASKA430R"}}, "got the mask MASK430R, expected MASK335R"),
-        ({"header": {"DETECTOR": "NRCA2"}}, "got the detector NRCA2, expected NRCALONG"),
-        ({"name": "HD 2 4"}, "one of the frames that the reference star HD 2 was fitted to"),
-        ({"name": "copy.fits", "date": Time("2022-10-03T04:00")}, "copy.fits is one of the frames"),
-    ],
-)
-def test_a_reference_star_of_other_frames_is_refused(changes, message):
-    first, second = science()
-    header = fits.Header({**first.header, **changes.get("header", {})})
-    other = replace(sequence(), science=(replace(first, **{**changes, "header": header}), second))
-    with pytest.raises(IncompatibleSetupError, match=message):
-        pipeline.prepare(other, fitted_reference(), ReduceOptions(size=SIZE))

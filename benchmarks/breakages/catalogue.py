@@ -217,6 +217,19 @@ def _frames_and_files() -> list[Breakage]:
             "sequence admission",
         ),
         Breakage(
+            "star-epochs", "coordinates of one star are compared at one epoch",
+            "years = year - np.array(self.epochs or (_OLDEST, year))",
+            "years = 0 * np.array(self.epochs or (_OLDEST, year))", "admission",
+        ),
+        Breakage(
+            "few-pixels", "frames without valid pixels about the star are left out",
+            "if share >= _VALID:", "if share >= 0:", "admission",
+        ),
+        Breakage(
+            "asn-roles", "associations say which frames are the target's",
+            "return known.pop() if len(known) == 1 else None", "return None", "associations",
+        ),
+        Breakage(
             "wcs", "east is left of north in the WCS of products",
             "steps = np.array([[-cosine, sine], [sine, cosine]]) @ steps / 3600",
             "steps = np.array([[cosine, sine], [-sine, cosine]]) @ steps / 3600",
@@ -224,8 +237,7 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "atomic", "a product is there whole or not at all",
-            "        yield temporary\n        if path.exists():",
-            "        temporary = path\n        yield temporary\n        if not path.exists():",
+            "        yield temporary\n        _move(temporary, path)", "        yield path",
             "files_units",
         ),
         Breakage(
@@ -264,6 +276,10 @@ def _fits() -> list[Breakage]:
             "> _BETTER * _explained(model.weigh(sources)).max()",
             "< _BETTER * _explained(model.weigh(sources)).max()",
             "outliers",
+        ),
+        Breakage(
+            "spectrum-errors", "a column of errors is no spectrum",
+            "and each.ndim == 1 and not _is_error(each)", "and each.ndim == 1", "spectrum_files",
         ),
         Breakage(
             "no-map", "without a map the star's flux is uncertain by 40 %",
@@ -355,7 +371,7 @@ def _around() -> list[Breakage]:
         ),
         Breakage(
             "job-content", "a survey notices frames whose content changed",
-            '"frames": sorted(inputs[str(path)] for path in files)',
+            '"frames": sorted(inputs[str(path)] for path in frames)',
             '"frames": sorted(map(str, files))', "survey",
         ),
         Breakage(

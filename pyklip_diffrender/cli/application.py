@@ -5,15 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import platform
-import shutil
-import time
 from collections import abc
-from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -28,22 +25,23 @@ from pyklip_diffrender.cli.session import (
     file_type,
     free_memory,
     keep_freed_memory,
+    named_files,
     open_streams,
     option,
     outputs,
     require_frames,
+    require_in_place,
     search,
     together,
     wavefront,
 )
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, RefinementError
 
 if TYPE_CHECKING:
     from pyklip_diffrender.scene.sequence import Sequence
     from pyklip_diffrender.wavefront.opd import Rule
 
 __all__ = [
-    "Check",
     "application",
     "demo",
     "detect_in_file",
@@ -58,7 +56,7 @@ __all__ = [
 
 # The commands that compute something.
 
-_DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
+_DEMO = ("demo.png", "demo.fits", "demo.ecsv", "candidates.ecsv")
 
 
 @click.command(
@@ -91,7 +89,8 @@ def demo(
 
     Needs no data, half a minute and 2 GB of memory.
     """
-    run.claim_folder(output, _DEMO, overwrite)
+    products = named_files(output, _DEMO, overwrite)
+    run.claim_folder(output, _DEMO)
     from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
     from pyklip_diffrender.drawing import save
 
@@ -103,9 +102,12 @@ def demo(
         progress=run.progress,
         device=run.device,
     )
-    written = write_demo(result, output)
-    figure = output / "demo.png"
-    save(draw_demo(result), figure)
+
+    def write(folder: Path) -> list[Path]:
+        save(draw_demo(result), folder / _DEMO[0])
+        return [folder / _DEMO[0], *write_demo(result, folder)]
+
+    figure, *written = products.replace(write)
     click.echo()
     click.echo("\n".join(result.table.pformat(max_lines=-1, max_width=-1)))
     click.echo(
@@ -126,6 +128,7 @@ def demo(
     if not len(result.detection.candidates):
         click.echo(f"  none above {result.detection.threshold:g} sigma")
     click.echo(f"\nwrote {figure} and {len(written)} more files")
+    require_in_place(products)
 
 
 def _star_callback(
@@ -190,9 +193,10 @@ def reduce_frames(
 ) -> None:
     """Subtract the star from all rolls of a target and search for planets.
 
-    FRAMES are calints files, or one folder of them. With --program they come from MAST. Filters,
-    and epochs more than 5 days apart, are reduced one by one, into a folder for each, then searched
-    together, and compared on one page.
+    FRAMES are calints files, folders of them, patterns ("frames/*_calints.fits") or association
+    files (*_asn.json). With --program they come from MAST. Filters, and epochs more than 5 days
+    apart, are reduced one by one, into a folder for each, then searched together, and compared on
+    one page.
     """
     require_frames(frames, program)
 
@@ -283,12 +287,14 @@ def psf(
     overwrite: bool,
 ) -> None:
     """Write the image of a star behind the coronagraph."""
-    run.claim_file(output, overwrite)
+    run.claim_file(output)
+    from pyklip_diffrender.io.files import require_new, write_fits
+
+    require_new([output], overwrite)
     import numpy as np
     from astropy.io import fits
 
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.io.files import write_fits
     from pyklip_diffrender.io.headers import fits_text
     from pyklip_diffrender.wavefront.opd import as_opd_map, resample
 
@@ -302,8 +308,8 @@ def psf(
     edge = size / 2 * min(model.detector.pixelscale)
     if not np.abs(offset).max() < edge:
         raise IncompatibleSetupError(
-            f"offset: got {offset[0]:g} {offset[1]:g}, expected a star inside the image, less "
-            f"than {edge:.3g} arcsec from its centre along x and y. Choose a larger size (--size)"
+            f"--offset: got {offset[0]:g} {offset[1]:g}, expected a star inside the image, less "
+            f"than {edge:.3g} arcsec from its centre along x and y. Choose a larger --size"
         )
     map_ = as_opd_map(opd)
     pixels = model.calc_psf(opd=resample(map_.data, model.npix), star_offset=offset)["DET_SAMP"]
@@ -339,7 +345,6 @@ def survey(run: Run, /, file: Path, output: Path, scheduler: str | None) -> int:
     """
     from pyklip_diffrender.cli.reducing import run as run_survey
 
-    run.configured = True
     return run_survey(file, output, scheduler, progress=run.progress)
 
 
@@ -412,13 +417,15 @@ def learn(
 ) -> None:
     """Learn the flat-field pattern from the frames of many stars.
 
-    FRAMES are calints files, or folders of them, of stars without bright companions or disks; with
-    --program they come from MAST. Every star is fitted alone, and again with the pattern of the
+    FRAMES are calints files, folders of them, patterns ("frames/*_calints.fits") or association
+    files (*_asn.json), of stars without bright companions or disks; with --program they come from
+    MAST. Every star is fitted alone, and again with the pattern of the
     others, which tells how much a pattern is worth for a star that it was not learned from. The
     same command goes on where an earlier one was stopped.
     """
     require_frames(frames, program)
-    run.claim_file(output, overwrite)
+    run.claim_file(output)
+    products = named_files(output.parent, (output.name,), overwrite)
     from pyklip_diffrender.archive import fetch_calints
     from pyklip_diffrender.cli.reducing import map_for
     from pyklip_diffrender.io.files import without_fits_suffix
@@ -442,146 +449,78 @@ def learn(
         device=run.device,
         progress=run.progress,
     )
-    library.write(output, overwrite=overwrite)
+    (path,) = products.replace(lambda folder: [library.write(folder / output.name)])
     table = library.validation
     for name in ("chi2_alone", "chi2_with_others", "shown"):
         table[name].info.format = ".2f"
     click.echo("\n".join(table[list(_COLUMNS)].pformat(max_lines=-1, max_width=-1)))
     if len(library.stars) < 2:
         click.echo("only one star: nothing tests its pattern, and it is not used for that star")
-    click.echo(f"wrote {output}: {len(library.patterns)} frames of {', '.join(library.stars)}")
+    click.echo(f"wrote {path}: {len(library.patterns)} frames of {', '.join(library.stars)}")
+    require_in_place(products)
 
 
 # ``pyklip-diffrender doctor``: whether the package can work here.
 
 _LIBRARIES = (
-    "torch", "numpy", "scipy", "astropy", "poppy", "photutils", "pyklip", "matplotlib", "tqdm",
-    "click", "tomli_w",
+    "torch", "numpy", "scipy", "astropy", "poppy", "photutils", "pyklip", "matplotlib",
 )  # fmt: skip
-
-_TABLES = (
-    "jwst_primary_polygons", "nircam_filters", "nircam_maskrnd_openings", "nircam_si_zernikes",
-)  # fmt: skip
-
-_NEEDED = 2e9
-"""Bytes of memory that the demo, and a reduction of one roll, take."""
-
-_PRODUCTS = 0.5e9
-"""Bytes on disk that the products of a reduction of two rolls may take."""
-
 
 _EXPLAINED = 1.5
 """Chi-squared per pixel above which the self-test has failed; 0.8 is usual."""
 
 
-@dataclass(frozen=True)
-class Check:
-    """Outcome of one check."""
-
-    state: Literal["ok", "note", "FAIL"]
-    text: str
-
-
-def check_libraries(names: Iterable[str] = _LIBRARIES) -> Iterator[Check]:
-    """Import every library that the package needs."""
-    yield Check("ok", f"pyklip-diffrender {__version__}, Python {platform.python_version()}")
+def check_libraries(names: Iterable[str] = _LIBRARIES) -> str:
+    """Import libraries that the package needs; returns their versions."""
+    texts = [f"pyklip-diffrender {__version__}", f"Python {platform.python_version()}"]
     for name in names:
-        try:
-            import_module(name)
-            yield Check("ok", f"{name} {version(name.replace('_', '-'))}")
-        except PackageNotFoundError:
-            yield Check("note", f"{name} can be imported, and has no version")
-        except Exception as error:  # Broken libraries raise anything.
-            yield Check(
-                "FAIL",
-                f"{name} cannot be imported ({error}). Install the package again, in a fresh "
-                "environment",
-            )
+        import_module(name)
+        texts.append(f"{name} {version(name)}")
+    return ", ".join(texts)
 
 
-def check_data(tables: Collection[str] = _TABLES) -> Iterator[Check]:
-    """Read the files that come with the package."""
-    from pyklip_diffrender.io.files import embedded_table
+def check_data() -> str:
+    """Read the library that comes with the package; the self-test reads the instrument's tables."""
     from pyklip_diffrender.pattern.library import package_library
 
-    try:
-        rows = sum(len(embedded_table(name)) for name in tables)
-        patterns = len(package_library().patterns)
-    except (DiffrenderError, OSError, ValueError) as error:
-        yield Check("FAIL", f"data files cannot be read ({error}). Install the package again")
-    else:
-        yield Check(
-            "ok",
-            f"data files: {rows} rows in {len(tables)} tables of the instrument, {patterns} "
-            "patterns of the flat field",
-        )
+    return f"{len(package_library().patterns)} patterns of the flat field"
 
 
-def check_stpsf() -> Iterator[Check]:
+def check_stpsf() -> str:
     """Look for stpsf, which is optional, and its data."""
-    from pyklip_diffrender.io.files import read_text
-
     try:
         name = f"stpsf {version('stpsf')}"
     except PackageNotFoundError:
-        yield Check("note", "stpsf is not installed; only bridges and maps from MAST need it")
-        return
+        return "without stpsf, which only bridges and maps from MAST need"
     folder = os.environ.get("STPSF_PATH") or os.environ.get("WEBBPSF_PATH")
     if not folder:
-        yield Check("note", f"{name}; STPSF_PATH is not set, so stpsf has no data files")
-    elif not (Path(folder) / "version.txt").is_file():
-        yield Check(
-            "FAIL",
-            f"{name}; STPSF_PATH is {folder}, which has no version.txt. Set it to stpsf's data "
-            "files, or unset it",
+        return f"{name}, without its data: STPSF_PATH is not set"
+    if not Path(folder, "version.txt").is_file():
+        raise IncompatibleSetupError(
+            f"STPSF_PATH: got {folder}, expected the folder with the data files of {name}, which "
+            "has a version.txt. Set it, or unset it"
         )
-    else:
-        data = read_text(Path(folder) / "version.txt").strip()
-        yield Check("ok", f"{name}; STPSF_PATH is {folder}, version {data}")
+    return f"{name}, with data in {folder}"
 
 
-def check_machine() -> Iterator[Check]:
-    """Look at processors, memory and disk."""
+def check_machine() -> str:
+    """Look at processors, GPUs and memory."""
     import torch
 
-    policy = os.environ.get("OMP_WAIT_POLICY", "active")
-    yield Check(
-        "ok",
-        f"{torch.get_num_threads()} threads on {os.cpu_count()} processors, wait policy {policy} "
-        "(in Python set OMP_WAIT_POLICY=passive before PyTorch is imported)",
+    gpus = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+    free = free_memory()
+    return (
+        f"{torch.get_num_threads()} threads on {os.cpu_count()} processors, "
+        f"{', '.join(gpus) or 'no GPU'}"
+        + ("" if free is None else f", {free / 1e9:.1f} GB of memory are free")
     )
-    if not torch.cuda.is_available():
-        yield Check("note", "PyTorch sees no GPU; the processor is used")
-    else:
-        for k in range(torch.cuda.device_count()):
-            memory = torch.cuda.get_device_properties(k).total_memory / 1e9
-            yield Check("ok", f"cuda:{k}: {torch.cuda.get_device_name(k)}, {memory:.0f} GB")
-    yield memory_check(free_memory())
-    yield disk_check(shutil.disk_usage(Path.cwd()).free)
 
 
-def memory_check(free: float | None) -> Check:
-    """Judge so many bytes of free memory."""
-    if free is None:
-        return Check("note", "the system does not say how much memory is free")
-    text = f"{free / 1e9:.1f} GB of memory are free"
-    if free < _NEEDED:
-        return Check("FAIL", f"{text}; the demo and a reduction need 2 GB")
-    return Check("ok", text)
-
-
-def disk_check(free: float) -> Check:
-    """Judge so many free bytes on the disk."""
-    text = f"{free / 1e9:.1f} GB are free on the disk of this folder"
-    if free < _PRODUCTS:
-        return Check("FAIL", f"{text}; the products of a reduction need up to 0.5 GB")
-    return Check("ok", text)
-
-
-def check_fit(**settings: Any) -> Iterator[Check]:
+def check_fit(**settings: Any) -> str:
     """Simulate a telescope whose segments have moved, and refine its wavefront.
 
-    `settings` are those of `GaussNewton`, besides the basis.
+    `settings` are those of `GaussNewton`, besides the basis. Raises RefinementError if the fit is
+    not as good as it should be.
     """
     import numpy as np
     import torch
@@ -594,7 +533,6 @@ def check_fit(**settings: Any) -> Iterator[Check]:
     from pyklip_diffrender.wavefront.bases import SegmentMotions
     from pyklip_diffrender.wavefront.opd import random_opd
 
-    began = time.perf_counter()
     # The mirror is coarsely sampled and nothing but its segments moves, so that seconds suffice.
     model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=96, fov_pixels=24)
     basis, measured = SegmentMotions(), random_opd(1, npix=model.npix).data
@@ -605,19 +543,18 @@ def check_fit(**settings: Any) -> Iterator[Check]:
     lit = model.entrance.lit.numpy()
     before, after = (1e9 * float(np.std((opd - truth)[lit])) for opd in (measured, fit.wavefront))
     text = (
-        f"self-test in {time.perf_counter() - began:.0f} s: the error of the wavefront fell from "
-        f"{before:.1f} to {after:.1f} nm, with chi-squared {fit.chi2_per_pixel:.2f} per pixel"
+        f"self-test: the error of the wavefront fell from {before:.1f} to {after:.1f} nm, with "
+        f"chi-squared {fit.chi2_per_pixel:.2f} per pixel"
     )
     if fit.status.usable and after < 0.5 * before and fit.chi2_per_pixel < _EXPLAINED:
-        yield Check("ok", text)
-    else:
-        yield Check(
-            "FAIL", f"{text}, expected below {0.5 * before:.1f} nm and {_EXPLAINED}. Do not use "
-            "results of this installation; look at the versions above"
-        )  # fmt: skip
+        return text
+    raise RefinementError(
+        f"{text}, expected below {0.5 * before:.1f} nm and {_EXPLAINED}. Do not use results of "
+        "this installation; look at the versions above", fit,
+    )  # fmt: skip
 
 
-CHECKS: tuple[Callable[[], Iterator[Check]], ...] = (
+CHECKS: tuple[Callable[[], str], ...] = (
     check_libraries,
     check_data,
     check_stpsf,
@@ -634,12 +571,14 @@ def doctor(run: Run) -> int:
 
     Takes about five seconds. The exit status is 1 if a check fails.
     """
-    failed = 0
+    failed = False
     for check in CHECKS:
-        for outcome in check():
-            click.echo(f"{outcome.state:4}  {outcome.text}")
-            failed += outcome.state == "FAIL"
-    return 1 if failed else 0
+        try:
+            click.echo(f"ok    {check()}")
+        except Exception as error:  # Broken libraries raise anything.
+            click.echo(f"FAIL  {type(error).__name__}: {error}")
+            failed = True
+    return int(failed)
 
 
 # The program: its commands, its messages and its exit status.

@@ -1,11 +1,11 @@
-"""The work of the commands `reduce`, `detect` and `survey`, and estimates of what it takes."""
+"""The work of the commands `reduce`, `detect` and `survey`."""
 
 from __future__ import annotations
 
-import math
+import os
 import sys
-from collections import Counter, abc
-from collections.abc import Callable
+from collections import abc
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import replace
 from json import dumps, loads
@@ -14,14 +14,13 @@ from typing import Any, Literal
 
 import click
 
-from pyklip_diffrender.cli.session import Run, config_remark, free_memory, with_options
-from pyklip_diffrender.detection import COMBINED, Combination
-from pyklip_diffrender.detection.recovery import TOGETHER
+from pyklip_diffrender.cli.session import Run, named_files, require_in_place
+from pyklip_diffrender.detection import COMBINED, Combination, checked_motion
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.instrument.spectrum import star_flux_density
 from pyklip_diffrender.io.files import read_text
-from pyklip_diffrender.io.progress import duration, numbered_stages, stage
+from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.options import Accuracy, ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternLibrary,
@@ -33,9 +32,8 @@ from pyklip_diffrender.reduction import (
     COMPARISON,
     PRODUCTS,
     SPECTRA,
-    UNFINISHED,
+    Preparation,
     ProductFolder,
-    existing_products,
     in_words,
     prepare,
     search_together,
@@ -43,8 +41,6 @@ from pyklip_diffrender.reduction import (
 )
 from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
 from pyklip_diffrender.reduction.visit import worth_joining
-from pyklip_diffrender.scene.exposure import proper_motion as motion_of
-from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import SHORT, Sequence
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
@@ -52,125 +48,11 @@ from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
 __all__ = [
-    "describe_plan",
+    "describe_steps",
     "map_for",
     "run",
     "run_reduction",
-    "size_of_products",
-    "steps_of",
 ]
-
-
-# Steps of a reduction, and estimates of their time, memory and room on disk.
-
-# Seconds on two cores. Measured for the first roll of G 7-34 in F444W, 80 x 80 pixels, in processor
-# time of one thread of an AMD EPYC: 40 s for the fit, 11 s for the search, 10 s for products. Two
-# threads take 0.7 of that. The place of HIP 65426 on the detector took 0.6 of its fit. In two rolls
-# of AU Mic, the fits with extended light take 1.2 (F356W) and 1.7 times (F444W) the time of the fit
-# before; in HIP 17695 the fit with the star's flux takes three fifths of it. Exponents as
-# documented.
-_FIT = 29.0
-_PLACE = 0.6
-_QUICK = 0.3
-_SEARCH = 8.0
-_DISK = 1.4
-_TIED = 0.6
-_WIDE = 10.0
-_COMPLETENESS = 90.0
-_WRITE = 7.0
-_FRAMES = 0.88
-_JOINT = 0.9
-_PIXELS = 0.17
-_MEMORY = 1.4e9
-_MEMORY_PER_FRAME = 0.4e9
-
-# Bytes that reading takes for each of the largest file: pixels and errors of four bytes and a mask,
-# of files with flags and no more. Measured: 0.75 (tests/test_memory_of_reading.py bounds it).
-_READING = 0.8
-_BEFORE_READING = 0.7e9
-
-# Bytes for frames of 80 x 80 pixels.
-_REPORT = 5e6
-_PRODUCTS = 10e6
-_DERIVATIVES = 50e6
-
-
-def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, float]]:
-    """The stages of a reduction of a cut sequence, each with its duration on two cores, s."""
-    count = len(sequence.science)
-    systematics = options.systematics
-    area = (options.side / 80) ** 2
-    # The time of a fit grows with the powers `_PIXELS` of the pixels and `_FRAMES` of the frames.
-    fit = _FIT * area**_PIXELS * (_QUICK if options.accuracy == "quick" else 1.0)
-    steps = []
-    searched = systematics == "auto" or isinstance(systematics, PatternLibrary)
-    libraries = [systematics] if isinstance(systematics, PatternLibrary) else []
-    library = combine_libraries([*libraries, package_library()])
-    known = searched and known_systematics(sequence.science[0], library=library) is not None
-    teaching = frames_for_pattern(sequence, options)
-    stars = Counter(each.target for each in teaching)
-    if known:
-        steps += [
-            (f"place of {each.name} on the detector", _PLACE * fit)
-            for each in sequence.science
-            if each.first_pixel is None
-        ]
-    elif searched or systematics == "references":
-        steps += [(f"reference star {star}", fit * n**_FRAMES) for star, n in stars.items()]
-    joint = fit * count**_FRAMES * (1 + _TIED * (options.star_flux is not None))
-    steps.append(("wavefront", joint))
-    others: abc.Sequence[Observation] = frames_in_likelihood(sequence, options)
-    if known or (teaching and searched):
-        others = worth_joining(others)
-    if others:
-        steps.append(("reference stars and target together", fit * _JOINT * (count + len(others))))
-    refit = _DISK * joint * options.disk
-    search = _SEARCH * area * count
-    steps.append(("search", search))
-    more = options.disk or options.wide or options.injections or options.completeness
-    if more:
-        steps.append(("products after the stage search", _WRITE))
-    if options.disk:
-        steps.append(("extended light, and wavefront without it", refit))
-        steps.append(("search without extended light", search))
-    if options.wide:
-        steps.append(("whole frames", _WIDE * count))
-    if options.injections:
-        seconds = joint + refit + _SEARCH * area * count
-        # Each round adds several planets at once, and fits and searches the frames again.
-        rounds = math.ceil(options.injections / TOGETHER)
-        steps.append((f"{options.injections} injected planets", rounds * seconds))
-    if options.completeness:
-        steps.append(("completeness", _COMPLETENESS * area * count))
-    steps.append(("products", _WRITE))
-    return steps
-
-
-def size_of_products(sequence: Sequence, *, derivatives: bool) -> float:
-    """Bytes that the products of a reduction may take, with some to spare."""
-    ny, nx = sequence.science[0].shape
-    each = _PRODUCTS + _DERIVATIVES * derivatives
-    return _REPORT + each * len(sequence.science) * nx * ny / 80**2
-
-
-def describe_plan(sequence: Sequence, options: ReduceOptions) -> str:
-    """Steps, time and memory as lines of text; arguments as for `steps_of`."""
-    steps = steps_of(sequence, options)
-    lines = [f"{k}. {name}: about {duration(s)}" for k, (name, s) in enumerate(steps, 1)]
-    total = sum(seconds for _, seconds in steps)
-    frames = len(sequence.science) + len(frames_in_likelihood(sequence, options))
-    memory = _MEMORY + _MEMORY_PER_FRAME * frames * (options.side / 80) ** 2
-    files = [row.path for row in sequence.rows if row.path is not None and row.path.exists()]
-    largest = max((path.stat().st_size for path in files), default=0)
-    # A reduction reads before it fits, and what it has read is then the means of integrations.
-    memory = max(memory, _BEFORE_READING + _READING * largest)
-    free = free_memory()
-    of = "" if free is None else f" ({free / 1e9:.1f} GB are free)"
-    lines.append(
-        f"in all about {duration(total)} on two cores, up to twice as long if a companion makes "
-        f"a second fit necessary, and {memory / 1e9:.1f} GB of memory{of}"
-    )
-    return "\n".join(lines)
 
 
 # The work of the commands `reduce` and `detect`.
@@ -189,14 +71,13 @@ def run_reduction(
     figures: Literal["pdf", "png", "svg"] | None,
     json: bool,
     dry_run: bool,
-    resume: bool,
     quick: bool,
     opd: str,
     opd_date: Rule | None,
     star_sed: str | None,
     spectra: tuple[str, ...] = (),
-    proper_motion: tuple[float, float] | None = None,
-    parallax: float | None = None,
+    proper_motion: tuple[str, str] | None = None,
+    parallax: str | None = None,
     **options: Any,
 ) -> None:
     """Reduce the epochs and filters of a target, write all products and say what they show.
@@ -205,16 +86,22 @@ def run_reduction(
     """
     if dry_run and json:
         raise click.UsageError("A --dry-run has no summary to print with --json.")
-    if resume and overwrite:
-        raise click.UsageError("--resume keeps products, and --overwrite replaces them.")
     if star_sed is not None and options["star_flux"] is not None:
         raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
     try:
         accuracy: Accuracy = "quick" if quick else ReduceOptions.accuracy
+        checked_motion(proper_motion, parallax)
         checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
-        raise click.UsageError(with_options(str(error)) + config_remark()) from error
-    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED), overwrite or resume)
+        raise click.UsageError(str(error)) from error
+    # What is there now may be replaced if the user says so, but not what other runs write later.
+    writing: dict[str, Any] = {
+        "derivatives": derivatives, "figures": figures, "overwrite": overwrite,
+    }  # fmt: skip
+    whole = ProductFolder(output, **writing)
+    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
+    above = named_files(output, (*COMPARISON, *COMBINED), overwrite)
+    earlier = [whole, *(ProductFolder(each, overwrite=True) for each in _listed(output))]
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
         sequences = read()
@@ -222,82 +109,132 @@ def run_reduction(
             return
         several = len(sequences) > 1
         folders = [output / name for name in _names(sequences)] if several else [output]
-        filters = list(dict.fromkeys(each.filter or "unknown" for each in sequences))
-        if checked.star_flux is not None and len(filters) > 1:
-            raise IncompatibleSetupError(
-                f"star_flux: got one flux density for {', '.join(filters)}, expected one for each. "
-                "Choose a --filter, or give the star's spectrum with --star-sed"
-            )
+        written = [ProductFolder(each, **writing) for each in folders] if several else [whole]
+        _require_flux_and_spectra(sequences, checked, spectra)
         prepared = []
         for sequence, folder in zip(sequences, folders, strict=True):
             if several:
-                run.claim_folder(folder, tuple(PRODUCTS), overwrite or resume)
+                run.claim_folder(folder, tuple(PRODUCTS))
                 click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
-            _show(sequence)
-            map_ = map_for(sequence, opd, opd_date)
-            click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
-            prepared.append(prepare(sequence, map_, _with_flux(checked, star_sed, sequence.filter)))
+            prepared.append(_prepared(sequence, checked, opd, opd_date, star_sed))
             if dry_run:
-                click.echo(describe_plan(prepared[-1].sequence, prepared[-1].options))
-        if several:
-            _require_spectra(spectra, filters)
-        sizes = (size_of_products(each.sequence, derivatives=derivatives) for each in prepared)
-        run.require_room(output, sum(sizes))
+                click.echo(describe_steps(prepared[-1].sequence, prepared[-1].options))
         if dry_run:
             return
         summaries = {}
-        for preparation, folder in zip(prepared, folders, strict=True):
-            if resume and _is_finished(folder):
-                click.echo(f"{folder}: this reduction has finished")
-            else:
-                products = ProductFolder(
-                    folder,
-                    derivatives=derivatives,
-                    figures=figures,
-                    overwrite=overwrite,
-                    resume=resume,
-                )
-                try:
-                    with numbered_stages(dict(steps_of(preparation.sequence, preparation.options))):
-                        reduction = preparation.run(progress=run.progress, products=products)
-                        with stage("products"):
-                            written = products.finish(reduction)
-                except KeyboardInterrupt:
-                    if (folder / UNFINISHED).exists():
-                        click.echo("to go on, repeat the command with --resume", err=True)
-                    raise
-                click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")
-            summary = loads(read_text(folder / "summary.json"))
-            summaries[folder.name] = summary
-            status = summary["status"]
-            click.echo(f"\n{summary['sentence']}\n{status['name']}: {status['message']}.")
-            click.echo(with_options(status["advice"]))
-        if overwrite:
-            _remove_others(output, folders)
+        for preparation, products in zip(prepared, written, strict=True):
+            summary = _reduced(preparation, products, progress=run.progress)
+            summaries[products.folder] = summary
+        place = above.place() if several else output
+        above.clear()
+        for each in earlier:
+            if each.asked not in folders:
+                each.clear()
+                if each is not whole and each.asked.is_dir() and not any(each.asked.iterdir()):
+                    each.asked.rmdir()
         if several:
-            first = sequences[0].science[0]
-            motion = proper_motion or motion_of(first.header, first.name)
-            combination = search_together(
-                folders, spectra=spectra or SPECTRA, star=star_sed, motion=motion, parallax=parallax
+            summary = _compared(
+                summaries,
+                place,
+                spectra=spectra or SPECTRA,
+                star=star_sed,
+                motion=proper_motion,
+                parallax=parallax,
             )
-            if isinstance(combination, str):
-                combination = with_options(combination)
-            page, data = write_comparison(summaries, motion, output, combination)
-            summary = loads(read_text(data))
-            if isinstance(combination, Combination):
-                combination.write(output, overwrite=overwrite or resume)
-            click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
     if json:
         click.echo(dumps(summary, indent=2))
+    require_in_place(*written, above)
 
 
-def _is_finished(folder: Path) -> bool:
-    """Whether a folder has the products of a reduction that was not interrupted."""
-    return (folder / "summary.json").exists() and not (folder / UNFINISHED).exists()
+def _prepared(
+    sequence: Sequence,
+    options: ReduceOptions,
+    opd: str,
+    opd_date: Rule | None,
+    star_sed: str | None,
+) -> Preparation:
+    """Show the frames of a sequence and its wavefront map, and check that it can be reduced."""
+    _show(sequence)
+    map_ = map_for(sequence, opd, opd_date)
+    click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
+    return prepare(sequence, map_, _with_flux(options, star_sed, sequence.filter))
 
 
-def _require_spectra(spectra: tuple[str, ...], filters: list[str]) -> None:
-    """Raise an exception, before any fit, for spectra that cannot be combined in the filters."""
+def _reduced(preparation: Preparation, products: ProductFolder, *, progress: bool) -> Any:
+    """Reduce a sequence, write its products and say what they show; returns the summary."""
+    with numbered_stages():
+        reduction = preparation.run(progress=progress, products=products)
+        with stage("products"):
+            files = products.keep(reduction)
+    click.echo(f"wrote {products.folder / 'report.html'} and {len(files) - 1} more files")
+    summary = loads(read_text(products.folder / "summary.json"))
+    status = summary["status"]
+    click.echo(f"\n{summary['sentence']}\n{status['name']}: {status['message']}.")
+    click.echo(status["advice"])
+    return summary
+
+
+def _compared(summaries: Mapping[Path, Any], place: Path, **search: Any) -> Any:
+    """Search finished reductions together, and compare them on a page in the folder `place`.
+
+    `summaries` are by the folders of the reductions, and `search` the arguments of
+    `search_together`. Returns the content of ``comparison.json``.
+    """
+    combination = search_together(list(summaries), **search)
+    named = {
+        Path(os.path.relpath(folder, place)).as_posix(): each for folder, each in summaries.items()
+    }
+    page, data = write_comparison(named, place, combination)
+    if isinstance(combination, Combination):
+        combination.write(place)
+    click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
+    return loads(read_text(data))
+
+
+def describe_steps(sequence: Sequence, options: ReduceOptions) -> str:
+    """The steps of a reduction of a cut sequence, one in each line."""
+    systematics = options.systematics
+    searched = systematics == "auto" or isinstance(systematics, PatternLibrary)
+    libraries = [systematics] if isinstance(systematics, PatternLibrary) else []
+    library = combine_libraries([*libraries, package_library()])
+    known = searched and known_systematics(sequence.science[0], library=library) is not None
+    teaching, joining = (
+        frames(sequence, options) for frames in (frames_for_pattern, frames_in_likelihood)
+    )
+    steps = []
+    if known:
+        unplaced = [each.name for each in sequence.science if each.first_pixel is None]
+        steps += [f"place of {name} on the detector" for name in unplaced]
+    elif searched or systematics == "references":
+        stars = dict.fromkeys(each.target for each in teaching)
+        steps += [f"reference star {star}" for star in stars]
+    steps.append("wavefront")
+    is_known = known or (searched and bool(teaching))
+    if worth_joining(joining) if is_known else joining:
+        steps.append("reference stars and target together")
+    steps.append("search")
+    if options.disk:
+        steps += ["extended light, and wavefront without it", "search without extended light"]
+    if options.wide:
+        steps.append("whole frames")
+    if options.injections:
+        steps.append(f"{options.injections} injected planets")
+    if options.completeness:
+        steps.append("completeness")
+    steps.append("products")
+    return "\n".join(f"{number}. {step}" for number, step in enumerate(steps, 1))
+
+
+def _require_flux_and_spectra(
+    sequences: abc.Sequence[Sequence], options: ReduceOptions, spectra: tuple[str, ...]
+) -> None:
+    """Raise an exception, before any fit, for what does not hold in several filters."""
+    filters = list(dict.fromkeys(each.filter or "unknown" for each in sequences))
+    if options.star_flux is not None and len(filters) > 1:
+        raise IncompatibleSetupError(
+            f"--star-flux: got one flux density for {', '.join(filters)}, expected one for each. "
+            "Choose a --filter, or give the star's spectrum with --star-sed"
+        )
     listed = [each for each in spectra if each != "free"]
     if listed and len(filters) > 1 and "unknown" not in filters:
         planet_spectra(listed, filters)
@@ -323,22 +260,15 @@ def _names(sequences: abc.Sequence[Sequence]) -> list[str]:
     return [f"{day}_{name}" for day, name in zip(days, filters, strict=True)]
 
 
-def _remove_others(output: Path, folders: list[Path]) -> None:
-    """Remove the products of an earlier run from other folders than those of this one."""
-    earlier = [output]
-    page, data = (output / name for name in COMPARISON)
-    if data.exists():
-        with suppress(ValueError, KeyError, TypeError):
-            listed = loads(read_text(data))["reductions"]
-            # Only names, so that a file that was changed cannot point outside the folder.
-            earlier += [output / Path(each["folder"]).name for each in listed]
-    for folder in set(earlier) - set(folders):
-        for path in existing_products(folder):
-            path.unlink()
-        if folder != output and folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-    for path in (page, data, *(output / name for name in COMBINED)):
-        path.unlink(missing_ok=True)
+def _listed(output: Path) -> list[Path]:
+    """Folders of the epochs and filters of an earlier run."""
+    _, data = (output / name for name in COMPARISON)
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        listed = loads(read_text(data))["reductions"]
+        # Only names, so that a file that was changed cannot point outside the folder.
+        folders = {output / Path(each["folder"]).name for each in listed}
+        return sorted(folder for folder in folders if folder.is_dir())
+    return []
 
 
 def _day(sequence: Sequence) -> str:

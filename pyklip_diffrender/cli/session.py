@@ -5,22 +5,23 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-import re
 import shutil
 import sys
-import tomllib
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.io.files import OutputFolder
 
 __all__ = [
     "COMMON",
@@ -29,20 +30,19 @@ __all__ = [
     "Run",
     "archive",
     "common",
-    "config_remark",
     "declared",
     "file_type",
     "free_memory",
     "keep_freed_memory",
+    "named_files",
     "open_streams",
     "option",
     "outputs",
-    "read_config",
     "require_frames",
+    "require_in_place",
     "search",
     "together",
     "wavefront",
-    "with_options",
 ]
 
 
@@ -91,47 +91,8 @@ PROGRAM = "pyklip-diffrender"
 _log = logging.getLogger(__name__)
 
 
-_FLAGS: dict[str, str] = {}
-"""Options of all commands by the names of their arguments; filled where they are declared."""
-
-_AMBIGUOUS = "star"
-"""Name of an argument that in messages may also be what --star-sed says."""
-
-_OTHERS = {"image_mask": "mask"}
-"""Arguments with other names than their options."""
-
-_BOTH = re.compile(r"\w+(=True)? \((--[\w-]+)( on the command line)?\)")
-_CLASS = re.compile(r"\ban? [A-Z][a-z]+[A-Z]?\w*, (?=.* or )")
-_QUANTITY = re.compile(r" or an? [\w ]+ \([^()]* \* u\.\w+\)")
-
-
-def with_options(message: str) -> str:
-    """Name options of the command line where a message names arguments of Python.
-
-    Examples
-    --------
-    >>> with_options("threshold: got -3 sigma, expected a positive number")
-    '--threshold: got -3 sigma, expected a positive number'
-    >>> with_options("repeat the reduction with disk=True (--disk on the command line)")
-    'repeat the reduction with --disk'
-    >>> with_options("a.fits exists; replace it with overwrite=True")
-    'a.fits exists; replace it with --overwrite'
-    """
-    for name, other in _OTHERS.items():
-        message = message.replace(f"{name}: ", f"{other}: ")
-    message = _QUANTITY.sub("", _CLASS.sub("", _BOTH.sub(r"\2", message)))
-    names = "|".join(sorted(_FLAGS, key=len, reverse=True))
-    first, assigned = rf"(?=(?:, (?:{names}))*: )", r"=(?:True|\.\.\.)"
-    named = rf"(?<![\w./-])({names})(?:{first}|{assigned})"
-    return re.sub(named, lambda found: _FLAGS[found[1]], message)
-
-
 class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
     """Messages on standard error that do not break a progress bar."""
-
-    def __init__(self, run: Run) -> None:
-        super().__init__()
-        self.run = run
 
     def emit(self, record: logging.LogRecord) -> None:
         from tqdm import tqdm
@@ -140,8 +101,6 @@ class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
 
     def format(self, record: logging.LogRecord) -> str:
         message = record.getMessage()
-        if not self.run.configured:
-            message = with_options(message)
         if record.levelno < logging.WARNING:
             return message
         warning = "warning: " if record.levelno == logging.WARNING else ""
@@ -177,6 +136,10 @@ def open_streams() -> Iterator[None]:
                     setattr(sys, name, stream)
 
 
+_LEAST_ROOM_BYTES = 1e8
+"""Room for the products of two rolls of 80 x 80 pixels, which take 30 MB, and of more frames."""
+
+
 @dataclass
 class Run:
     """One run of a command."""
@@ -185,9 +148,6 @@ class Run:
     progress: bool = False
     # Of PyTorch.
     device: str = ReduceOptions.device
-    # Whether names in messages are keys of a configuration file, as those of surveys, and no
-    # options of the command line.
-    configured: bool = False
     _output: Path | None = None
     _before: dict[Path, int] = field(default_factory=dict)
     _handlers: list[logging.Handler] = field(default_factory=list)
@@ -218,7 +178,7 @@ class Run:
         self, *, verbose: bool, quiet: bool, log_file: Path | None, device: str, threads: int | None
     ) -> None:
         """Take what the options of all commands say."""
-        on_terminal = _OnTerminal(self)
+        on_terminal = _OnTerminal()
         # Away from a terminal a bar is noise: the stages and a line a minute take its place.
         is_terminal = sys.stderr.isatty()
         self.progress = is_terminal and not quiet
@@ -251,17 +211,15 @@ class Run:
         logging.getLogger().addHandler(handler)
         self._handlers.append(handler)
 
-    def claim_folder(self, folder: Path, products: tuple[str, ...], overwrite: bool) -> None:
-        """Raise IncompatibleSetupError if products cannot be written or would be replaced."""
+    def claim_folder(self, folder: Path, products: tuple[str, ...]) -> None:
+        """Raise IncompatibleSetupError if products cannot be written."""
         _require_no_broken_link(folder, "--output")
-        if folder.exists() and not folder.is_dir():
-            raise IncompatibleSetupError(f"--output: {folder} is a file, expected a folder")
         for name in products:
             _require_no_broken_link(folder / name, "--output")
-        self._claim(folder, _existing(folder), [folder / name for name in products], overwrite)
+        self._claim(folder, _existing(folder))
 
-    def claim_file(self, path: Path, overwrite: bool) -> None:
-        """Raise IncompatibleSetupError if a file cannot be written or would be replaced."""
+    def claim_file(self, path: Path) -> None:
+        """Raise IncompatibleSetupError if a file cannot be written."""
         _require_no_broken_link(path, "OUTPUT")
         if not path.absolute().parent.is_dir():
             raise IncompatibleSetupError(
@@ -269,28 +227,23 @@ class Run:
             )
         if path.is_dir():
             raise IncompatibleSetupError(f"--output: {path} is a folder, expected a file")
-        self._claim(path, path.absolute().parent, [path], overwrite)
+        self._claim(path, path.absolute().parent)
 
-    def _claim(self, output: Path, folder: Path, products: list[Path], overwrite: bool) -> None:
-        taken = [path for path in products if path.exists()]
-        if taken and not overwrite:
-            verb = "exists" if len(taken) == 1 else "exist"
-            raise IncompatibleSetupError(
-                f"{', '.join(map(str, taken))} {verb}; choose another place, or replace with "
-                "--overwrite"
-            )
+    def _claim(self, output: Path, folder: Path) -> None:
         if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
             raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
-        self._output, self._before = output, _files(output)
-
-    def require_room(self, folder: Path, size: float) -> None:
-        """Raise IncompatibleSetupError if the disk has no room for products of `size` bytes."""
-        free = shutil.disk_usage(_existing(folder)).free
-        if free < size:
+        disk = shutil.disk_usage(folder)
+        if not disk.total:
             raise IncompatibleSetupError(
-                f"--output: {folder} has {free / 1e6:.0f} MB of room, expected at least "
-                f"{size / 1e6:.0f} MB. Make room, or choose another place"
+                f"{output} cannot be written: {folder} is of the system, and takes no files. "
+                "Choose another place"
             )
+        if disk.free < _LEAST_ROOM_BYTES:
+            raise IncompatibleSetupError(
+                f"{output}: got {disk.free / 1e6:.0f} MB of room on the disk, expected at least "
+                f"{_LEAST_ROOM_BYTES / 1e6:.0f} MB. Make room, or choose another place"
+            )
+        self._output, self._before = output, _files(output)
 
     def left(self) -> str:
         """Files that an interrupted run has left, as a sentence."""
@@ -300,6 +253,28 @@ class Run:
             return "nothing was written"
         names = sorted(path.name for path, _ in written)
         return f"these files in {output} are new and complete: {', '.join(names)}"
+
+
+def named_files(folder: Path, names: tuple[str, ...], overwrite: bool) -> OutputFolder:
+    """Folder for products of these names; raises ExistingFileError as an `OutputFolder`."""
+    from pyklip_diffrender.io.files import OutputFolder
+
+    return OutputFolder(
+        folder, lambda inside: [inside / name for name in names], overwrite=overwrite
+    )
+
+
+def require_in_place(*outputs: OutputFolder) -> None:
+    """Raise ExistingFileError, at the end of a run, if products are not where they should be."""
+    from pyklip_diffrender.io.files import moved_aside
+
+    elsewhere = [each for each in outputs if each.folder != each.asked]
+    if elsewhere:
+        asked, used = (
+            ", ".join(str(getattr(each, name)) for each in elsewhere)
+            for name in ("asked", "folder")
+        )
+        raise ExistingFileError(moved_aside(asked, used))
 
 
 def _require_no_broken_link(path: Path, option: str) -> None:
@@ -340,7 +315,7 @@ def _require_device(name: str) -> None:
         ) from error
 
 
-# Options that commands share, help by section, and configuration files.
+# Options that commands share, and help by section.
 
 Decorator = Callable[[Any], Any]
 
@@ -353,8 +328,6 @@ class _Option(click.Option):
     def __init__(self, *declarations: Any, section: str = "Options", **settings: Any) -> None:
         super().__init__(*declarations, **settings)
         self.section = section
-        if self.name is not None and self.name != _AMBIGUOUS:
-            _FLAGS[self.name] = self.opts[-1]
 
 
 def option(*declarations: str, section: str = "Options", **settings: Any) -> Decorator:
@@ -397,16 +370,6 @@ def file_type(**settings: Any) -> click.Path:
     return click.Path(path_type=Path, **settings)
 
 
-_CONFIG = f"{__name__}.config"
-"""Key of the file of --config in the contexts of a run."""
-
-
-def config_remark() -> str:
-    """Sentence about the file that options may come from, to end a message about one of them."""
-    path = click.get_current_context().meta.get(_CONFIG)
-    return "" if path is None else f" (options are also taken from {path})"
-
-
 class _Wavefront(click.types.StringParamType):
     """Name of a wavefront map, or a word in place of it; says what there is if it is missing."""
 
@@ -417,93 +380,8 @@ class _Wavefront(click.types.StringParamType):
         )
 
 
-def _config_callback(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
-    if path is not None:
-        ctx.meta[_CONFIG] = path
-        ctx.default_map = {**(ctx.default_map or {}), **read_config(ctx.command, path)}
-
-
-def read_config(command: click.Command, path: Path) -> dict[str, Any]:
-    """Read the defaults for a command, or for all commands of a group, from a TOML file.
-
-    Raises click.UsageError if the file cannot be read, or has an unknown option.
-    """
-    from pyklip_diffrender.io.files import read_text
-
-    try:
-        content = tomllib.loads(read_text(path))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise click.UsageError(f"--config: {path}: {error}") from error
-    general = {key: value for key, value in content.items() if not isinstance(value, Mapping)}
-    tables = {key: value for key, value in content.items() if isinstance(value, Mapping)}
-    general = _known(general, set(COMMON), f"{path}")
-    if not isinstance(command, click.Group):
-        table = tables.get(command.name or "", {})
-        return general | _known(table, _names(command), f"{path}: [{command.name}]")
-    unknown = sorted(set(tables) - set(command.commands))
-    if unknown:
-        raise click.UsageError(
-            f"--config: {path}: [{unknown[0]}] is no command, expected one of "
-            f"{', '.join(command.commands)}"
-        )
-    defaults: dict[str, Any] = dict(general)
-    for name, each in command.commands.items():
-        table = _known(tables.get(name, {}), _names(each), f"{path}: [{name}]")
-        defaults[name] = {key: v for key, v in general.items() if key in _names(each)} | table
-    return defaults
-
-
-def _names(command: click.Command) -> set[str]:
-    """Names of what a configuration file may set."""
-    names = {param.name or "" for param in command.params}
-    return names - {"config", "write_config"}
-
-
-def _known(table: Mapping[str, Any], names: set[str], where: str) -> dict[str, Any]:
-    values = {key.replace("-", "_"): value for key, value in table.items()}
-    unknown = sorted(set(values) - names)
-    if unknown:
-        raise click.UsageError(
-            f"--config: {where} has {unknown[0]!r}, which is no option. Known: "
-            f"{', '.join(sorted(name.replace('_', '-') for name in names))}"
-        )
-    return values
-
-
-def _write_config(path: Path, command: str, values: Mapping[str, Any], overwrite: bool) -> None:
-    import tomli_w
-
-    from pyklip_diffrender.io.files import replacing
-
-    if path.exists() and not overwrite:
-        raise click.UsageError(f"--write-config: {path} exists; replace it with --overwrite")
-    table = {
-        name.replace("_", "-"): _as_toml(value)
-        for name, value in values.items()
-        if value is not None
-    }
-    with replacing(path) as temporary:
-        temporary.write_text(tomli_w.dumps({command: table}), encoding="utf-8")
-
-
-def _as_toml(value: Any) -> Any:
-    if isinstance(value, list | tuple):
-        return [_as_toml(each) for each in value]
-    return str(value) if isinstance(value, Path) else value
-
-
 class Command(click.Command):
     """A command with help by section, whose general options may also stand before it."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the options; messages about values of a configuration file name it."""
-        try:
-            return super().parse_args(ctx, args)
-        except click.BadParameter as error:
-            name = "" if error.param is None else error.param.name or ""
-            if ctx.get_parameter_source(name) is ParameterSource.DEFAULT_MAP:
-                error.param_hint = f"{name.replace('_', '-')!r} in {ctx.meta.get(_CONFIG)}"
-            raise
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of the options."""
@@ -521,17 +399,11 @@ class Command(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Apply the general options, then run the command with its own."""
-        write_config = ctx.params.pop("write_config", None)
         if ctx.parent is not None:
             for name in COMMON:
                 before, own = (c.get_parameter_source(name) for c in (ctx.parent, ctx))
                 if before is ParameterSource.COMMANDLINE and own is not before:
                     ctx.params[name] = ctx.parent.params[name]
-        if write_config is not None:
-            overwrite = ctx.params.get("overwrite", False)
-            _write_config(write_config, ctx.info_name or "", ctx.params, overwrite)
-            click.echo(f"wrote {write_config}")
-            return None
         general = {name: ctx.params.pop(name) for name in COMMON}
         ctx.ensure_object(Run).configure(**general)
         return super().invoke(ctx)
@@ -548,14 +420,6 @@ common = _all(
     declared("device"),
     option("--threads", type=click.IntRange(min=1), metavar="N", section=_GENERAL,
            help="Number of threads; default: PyTorch's choice."),
-    option("--config", type=file_type(), metavar="FILE", section=_GENERAL, is_eager=True,
-           expose_value=False, callback=_config_callback,
-           help="Take defaults of the options from a TOML file."),
-)  # fmt: skip
-
-_WRITE_CONFIG = option(
-    "--write-config", type=file_type(), metavar="FILE", section=_GENERAL,
-    help="Write the options to a file for --config, and stop.",
 )  # fmt: skip
 
 _OVERWRITE = option(
@@ -575,7 +439,7 @@ def outputs(default: str | None = None, *, file: str | None = None) -> Decorator
     output = option(
         "-o", "--output", type=file_type(), metavar=kind, section="Output", help=help_, **needed
     )
-    return _all(output, _OVERWRITE, common, _WRITE_CONFIG)
+    return _all(output, _OVERWRITE, common)
 
 
 archive = _all(
@@ -612,14 +476,11 @@ search = _all(
     ),
     # A path that is not converted: shells complete files, and a name stays as it is.
     option("--star-sed", type=click.Path(), metavar="FILE", section="Brightness of the star",
-           help="Spectrum or photometry of the star, in place of --star-flux: two columns in "
-                "micron and Jy, a table with units, or a VOTable of VizieR's photometry viewer. "
+           help="Spectrum or photometry of the star, in place of --star-flux: a table in text, "
+                "FITS or VOTable with units; without any they are micron and Jy. "
                 'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
-    option("--resume", is_flag=True, section="Output",
-           help="Go on with a reduction that was interrupted: its fit and search are kept in the "
-                "folder of the products."),
     option("--dry-run", is_flag=True, section="Output",
-           help="Make all checks, show frames, wavefront map, steps, time and memory, and stop."),
+           help="Make all checks, show frames, wavefront map and steps, and stop."),
     option("--derivatives", is_flag=True, section="Output",
            help="Keep the fit's derivatives in fit.fits, which then takes ten times the space: "
            "they are needed to search the fit again."),
@@ -635,14 +496,12 @@ together = _all(
            section="Filters and epochs",
            help="Spectra of planets for the combined search of several filters or epochs; may be "
                 "repeated: black bodies of 150 to 1,500 K, the same flux density in all filters, "
-                "any fluxes, or a table of spectra with the wavelength (micron) in the first "
-                "column. Default: blackbody, flat and free."),
-    option("--proper-motion", type=float, nargs=2, metavar="EAST NORTH",
-           section="Filters and epochs",
-           help="Proper motion of the star, arcsec per year, to tell companions from background "
-                "sources; default: that of the headers."),
-    option("--parallax", type=click.FloatRange(min=0), metavar="ARCSEC",
-           section="Filters and epochs",
-           help="Parallax of the star, for the motion of background sources and of orbits between "
-                "epochs; default: neglected."),
+                "any fluxes, or a table of spectra with a column of wavelengths. "
+                "Default: blackbody, flat and free."),
+    option("--proper-motion", nargs=2, metavar="EAST NORTH", section="Filters and epochs",
+           help='Proper motion of the star, to tell companions from background sources: arcsec per '
+                'year, or with a unit, such as "377 mas/yr". Default: that of the headers.'),
+    option("--parallax", metavar="ANGLE", section="Filters and epochs",
+           help='Parallax of the star, for the motion of background sources and of orbits between '
+                'epochs: arcsec, or with a unit, such as "45 mas". Default: neglected.'),
 )  # fmt: skip

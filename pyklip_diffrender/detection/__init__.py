@@ -9,6 +9,7 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 from __future__ import annotations
 
 from pyklip_diffrender.detection import metrics
+from pyklip_diffrender.detection.association import Hypotheses, Motion, checked_motion
 from pyklip_diffrender.detection.candidates import (
     Candidates,
     ReferenceSource,
@@ -27,7 +28,7 @@ from pyklip_diffrender.detection.recovery import (
 )
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
 from pyklip_diffrender.detection.search_result import Detection, draw_curve
-from pyklip_diffrender.detection.sky_map import Hypotheses, Motion, SkyMap, hypotheses
+from pyklip_diffrender.detection.sky_map import SkyMap
 from pyklip_diffrender.detection.templates import combine_frames
 from pyklip_diffrender.detection.whole_frame import (
     has_bright_pixels_beyond,
@@ -48,6 +49,7 @@ __all__ = [
     "ReferenceSource",
     "SkyMap",
     "WideField",
+    "checked_motion",
     "combine",
     "combine_frames",
     "completeness",
@@ -57,7 +59,6 @@ __all__ = [
     "draw_curve",
     "fit_disk",
     "has_bright_pixels_beyond",
-    "hypotheses",
     "image_hdu",
     "measure",
     "measured_planet",

@@ -16,6 +16,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
+from pyklip_diffrender.detection.association import Hypotheses, Motion
 from pyklip_diffrender.detection.field import (
     Image,
     Positions,
@@ -23,24 +24,12 @@ from pyklip_diffrender.detection.field import (
     separation_of,
 )
 from pyklip_diffrender.detection.measurement import magnitudes
-from pyklip_diffrender.detection.sky_map import Hypotheses, Motion, SkyMap, SkyStack
+from pyklip_diffrender.detection.sky_map import SkyMap, SkyStack, date_of, epochs_of
 from pyklip_diffrender.instrument.spectrum import PlanetSpectra
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement.fit_file import text_hdu
-
-__all__ = [
-    "COMBINED",
-    "FREE",
-    "Combination",
-    "CombinedSource",
-    "candidates_table",
-    "limits_table",
-    "scales_of",
-    "star_of_filter",
-    "unmoved",
-]
 
 COMBINED = {
     "combined.fits": "maps of the combined search",
@@ -71,6 +60,8 @@ class CombinedSource:
     chi2: float  # Of the fluxes about the best listed spectrum; NaN without one.
     fluxes: SkyStack  # At the place, (filters,).
     hypotheses: Hypotheses | None
+    # Date (MJD), place (2,) and covariance (2, 2) at each epoch where it was seen.
+    sightings: tuple[tuple[float, Image, Image], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +93,9 @@ class Combination:
     candidates : QTable
         One row for each source, the least probable false alarm first; every column has a
         description.
+    sightings : QTable
+        Place of each candidate at each epoch at which it was seen by itself: the number of the
+        candidate (from 1), the date, offsets to the east and north with errors and correlation.
     limits : QTable
         Contrast of a planet that would be a candidate, by spectrum and separation.
     grid : ndarray, (ny, nx, 2)
@@ -132,6 +126,7 @@ class Combination:
     thresholds: dict[str, float]
     expected_false_candidates: float
     candidates: QTable
+    sightings: QTable
     limits: QTable
     grid: Image
     snr: Image
@@ -144,6 +139,11 @@ class Combination:
             f"<Combination of {len(self.maps)} reductions of {self.target}: {count} "
             f"candidate{'' if count == 1 else 's'}>"
         )
+
+    @property
+    def dates(self) -> list[float]:
+        """Mean date of each epoch, MJD, in order of time."""
+        return [date_of(each) for each in epochs_of(self.maps)]
 
     def measure(self, places: ArrayLike) -> QTable:
         """Fluxes of unmoved sources at places, with every spectrum; nothing is searched.
@@ -205,6 +205,7 @@ class Combination:
             ),
             "parallax_arcsec": None if self.motion is None else self.motion.parallax or None,
             "candidates": _plain_rows(self.candidates),
+            "sightings": _plain_rows(self.sightings),
             "limits": _plain_rows(self.limits),
             "remarks": list(self.remarks),
         }  # fmt: skip
@@ -265,7 +266,6 @@ def candidates_table(
     west = np.diag([-1.0, 1.0])
     positions = Positions(places @ west, west @ covariance @ west)
     separation_error, angle_error, polar = deviations_and_correlation(positions.polar_covariance)
-    east_error, north_error, correlation = deviations_and_correlation(covariance)
 
     def texts(values: Iterable[str]) -> NDArray[np.str_]:
         return np.array(list(values), dtype="U60")
@@ -288,11 +288,7 @@ def candidates_table(
         ("separation_error", separation_error, u.arcsec, ".4f", "standard deviation"),
         ("position_angle_error", angle_error, u.deg, ".2f", "standard deviation"),
         ("seppa_corr", polar, None, ".3f", "correlation of separation and position angle"),
-        ("delta_ra", places[:, 0], u.arcsec, ".4f", "offset to the east, dRA cos(Dec)"),
-        ("delta_ra_error", east_error, u.arcsec, ".4f", "standard deviation"),
-        ("delta_dec", places[:, 1], u.arcsec, ".4f", "offset to the north"),
-        ("delta_dec_error", north_error, u.arcsec, ".4f", "standard deviation"),
-        ("radec_corr", correlation, None, ".3f", "correlation of delta_ra and delta_dec"),
+        *_offsets(places, covariance),
         ("spectrum_chi2", numbers("chi2"), None, ".1f",
          "of the fluxes about the best listed spectrum; as many degrees of freedom as there are "
          "filters, less one"),
@@ -334,6 +330,34 @@ def candidates_table(
              "hypothesis of at least 99 %"),
         ]  # fmt: skip
     return _described(columns)
+
+
+def sightings_table(sources: Sequence[CombinedSource]) -> QTable:
+    """Make the table of places by epoch; see `Combination.sightings`."""
+    rows = [(k, *seen) for k, each in enumerate(sources, 1) for seen in each.sightings]
+    places = np.array([place for _, _, place, _ in rows]).reshape(-1, 2)
+    covariance = np.array([each for *_, each in rows]).reshape(-1, 2, 2)
+    numbers = np.array([each[0] for each in rows], dtype=int)
+    dates = np.array([each[1] for each in rows], dtype=float)
+    return _described(
+        [
+            ("candidate", numbers, None, "", "row in the table of candidates, from 1"),
+            ("epoch_mjd", dates, None, ".5f", "of the position, UTC"),
+            *_offsets(places, covariance),
+        ]
+    )
+
+
+def _offsets(places: Image, covariance: Image) -> list[tuple[str, Any, Any, str, str]]:
+    """Columns of offsets (k, 2) to the east and north, arcsec, with covariances (k, 2, 2)."""
+    east_error, north_error, correlation = deviations_and_correlation(covariance)
+    return [
+        ("delta_ra", places[:, 0], u.arcsec, ".4f", "offset to the east, dRA cos(Dec)"),
+        ("delta_ra_error", east_error, u.arcsec, ".4f", "standard deviation"),
+        ("delta_dec", places[:, 1], u.arcsec, ".4f", "offset to the north"),
+        ("delta_dec_error", north_error, u.arcsec, ".4f", "standard deviation"),
+        ("radec_corr", correlation, None, ".3f", "correlation of delta_ra and delta_dec"),
+    ]
 
 
 def limits_table(

@@ -388,7 +388,7 @@ def _fit_beside(path: Path) -> Refinement:
     if fit.stored_linear is None:
         raise IncompatibleSetupError(
             f"{file}: measurements need the linear model of the fit, and this file has none. Write "
-            "the reduction with derivatives=True (--derivatives), or pass the fit that was "
+            "the reduction with the option derivatives, or pass the fit that was "
             "searched: Detection.read(path, fit=fit)"
         )
     return fit

@@ -45,12 +45,12 @@ from pyklip_diffrender.detection.templates import (
     groups_of,
     has_only_reference_stars,
 )
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
-from pyklip_diffrender.io.files import open_fits, require_new, write_fits
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.headers import fits_unit, set_keyword
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.io.units import native_float64, require_positive, to_arcsec
+from pyklip_diffrender.io.units import require_positive, to_arcsec
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
@@ -326,46 +326,6 @@ class Disk:
         )
         write_fits(hdus, path)
         return path
-
-    @classmethod
-    def read(cls, folder: str | os.PathLike[str], fit: Refinement) -> Disk:
-        """Read disk.fits, which `write` wrote.
-
-        Parameters
-        ----------
-        folder : path
-        fit : Refinement
-            The attribute `fit` of the disk that was written.
-
-        Raises
-        ------
-        CorruptFileError
-            If the file is missing, truncated, or was not written by `write`.
-        """
-        path = Path(folder) / "disk.fits"
-        with open_fits(path) as hdus:
-            try:
-                table = hdus["SOURCES"].data
-                lights = sum(each.name == "LIGHT" for each in hdus)
-                arrays = {
-                    name: native_float64(hdus[name].data)
-                    for name in ("IMAGE", "IMAGE_ERROR", "HIDES_POINTS", "OFFSET_X", "OFFSET_Y")
-                }
-                return cls(
-                    fit,
-                    tuple(native_float64(hdus["LIGHT", k + 1].data) for k in range(lights)),
-                    arrays["IMAGE"],
-                    arrays["IMAGE_ERROR"],
-                    np.stack([arrays["OFFSET_X"], arrays["OFFSET_Y"]], axis=-1),
-                    np.stack([native_float64(table[name]) for name in "xy"], axis=1),
-                    native_float64(table["contrast"]),
-                    arrays["HIDES_POINTS"] > 0,
-                    float(hdus["SOURCES"].header["DRGAIN"]),
-                )
-            except (KeyError, TypeError, ValueError) as error:
-                raise CorruptFileError(
-                    f"{path}: not a file of Disk.write ({error}). Reduce the frames again"
-                ) from error
 
 
 # Extended light about a star, such as a disk: non-negative sources fitted with the star.

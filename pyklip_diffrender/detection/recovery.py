@@ -19,7 +19,7 @@ from pyklip_diffrender.detection.measurement import significance_of
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.progress import ProgressBar, progressed
+from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import full_circle
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
@@ -27,7 +27,6 @@ from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
     "CLEAR",
-    "TOGETHER",
     "completeness",
     "contrast_of_completeness",
     "measured_planet",
@@ -40,7 +39,7 @@ _STRENGTH = 1.6
 """Contrast of an injected planet over the limit with the small-sample correction, which is the
 threshold of the search. At a limit of 5 sigma, nearly all planets of 8 sigma should be detected."""
 
-TOGETHER = 7
+_TOGETHER = 7
 """Largest number of planets in the frames at a time."""
 
 _APART = 0.3
@@ -116,7 +115,7 @@ def recover_planets(
     curve = detection.contrast_curve
     planets = QTable(names=list(_COLUMNS), dtype=[float] * (len(_COLUMNS) - 1) + [bool])
     inner, outer = (float(end) for end in curve["separation"].value[[0, -1]])
-    together = int(np.clip((outer - inner) / _APART, 1, TOGETHER))
+    together = int(np.clip((outer - inner) / _APART, 1, _TOGETHER))
     for trial, start in enumerate(range(0, count, together)):
         rings = min(together, count - start)
         # Other separations in every set, so that sets fill the gaps.
@@ -140,7 +139,6 @@ def recover_planets(
             angle = full_circle(planet.position_angle + detection.north)
             measured = measured_planet(again, planet.offset, frames[0].flux)
             planets.add_row((planet.separation, angle, planet.contrast, *measured))
-        progressed((start + rings) / count)
     for name, unit in _UNITS.items():
         planets[name] = planets[name] * unit
     for name, form in _COLUMNS.items():

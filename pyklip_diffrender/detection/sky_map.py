@@ -1,4 +1,4 @@
-"""Maps on the sky of several searches: what epochs say of a source, and how often noise does.
+"""Maps on the sky of several searches, their sums, and how often noise exceeds a level.
 
 Places are offsets from the star to the east and to the north, arcsec. Between the pixels of a
 search, S/N is interpolated with splines: where the pixels are as large as those of F356W, it
@@ -8,13 +8,11 @@ differs from that of a template at the place by an rms of 0.13 or less.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from astropy.coordinates import get_body_barycentric
-from astropy.time import Time
 from numpy.polynomial import hermite_e
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
@@ -32,31 +30,28 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.scene.admission import EPOCH
 
-__all__ = [
-    "LIGHT",
-    "POSITION",
-    "YEAR",
-    "Family",
-    "Hypotheses",
-    "Motion",
-    "SkyMap",
-    "SkyStack",
-    "common_grid",
-    "date_of",
-    "epochs_of",
-    "hypotheses",
-    "level_of",
-    "maximum",
-    "signal",
-]
-
-
 _ORDER = 5
 """Of the splines between pixels. S/N maps have no higher frequencies than images, whose pixels are
 just small enough for them."""
 
 LIGHT = 1.5
 """lambda/D from a source at which its light ends, and within which two peaks are one source."""
+
+POSITION = 0.003
+"""Error of positions of different reductions beyond the noise, arcsec: orientation, distortion, and
+where the star is behind the mask."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapSource:
+    """A candidate of the search that made a map."""
+
+    place: Image  # (2,), east and north of the star, arcsec.
+    covariance: Image  # (2, 2), of the place, arcsec^2, with `POSITION`.
+    snr: float
+    sigmas: float  # The S/N in Gaussian standard deviations.
+    error: float  # Of the contrast, for a known image and a known flux of the star.
+    flux: tuple[float, float]  # Contrast and its error, with all that is not known.
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +72,7 @@ class SkyMap:
     threshold: float = 5.0  # S/N of a candidate of the single search.
     # Whether it is of real frames of one roll, where structures of the detector pass for sources.
     single_roll: bool = False
-    # (k, 4), east and north of the reduction's own candidates; what is to be added to the contrast
-    # of the map there, and by what its error is to be multiplied, so that they are those of all
-    # candidates fitted together.
-    fitted: Image = field(default_factory=lambda: np.zeros((0, 4)))
+    sources: tuple[MapSource, ...] = ()
 
     @classmethod
     def of(cls, detection: Detection, name: str) -> SkyMap:
@@ -116,14 +108,43 @@ class SkyMap:
             threshold=detection.threshold,
             single_roll=detection.rolls == 1 and detection.observation.is_nircam,
         )
-        places = plain.on_sky(offsets)
-        snr_there, _, error_there = plain.at(places)
-        own = detection.sources.detection_errors.numpy() * factor.of(offsets)
-        inside = np.isfinite(error_there)
-        error = np.where(inside, error_there, 1.0)
-        missing = detection.sources.contrasts.numpy() - snr_there * error
-        fitted = np.column_stack([places, missing, own / error])[inside]
-        return replace(plain, fitted=fitted)
+        return replace(plain, sources=tuple(plain._own(detection)))
+
+    def _own(self, detection: Detection) -> Iterator[MapSource]:
+        """Candidates of the search itself."""
+        for row in detection.candidates:
+            place = np.array([row["delta_ra"].value, row["delta_dec"].value])
+            deviations = np.array([row["delta_ra_error"].value, row["delta_dec_error"].value])
+            covariance = np.diag(deviations**2)
+            covariance[0, 1] = covariance[1, 0] = (
+                np.nan_to_num(row["radec_corr"]) * deviations[0] * deviations[1]
+            )
+            snr, contrast = float(row["snr"]), float(row["contrast"])
+            error = abs(contrast / snr)
+            yield MapSource(
+                place,
+                covariance + POSITION**2 * np.eye(2),
+                snr,
+                float(_gaussian(np.array(snr), self._freedom_at(place))),
+                error,
+                (contrast, max(float(row["contrast_error"]), error)),
+            )
+
+    @property
+    def residual(self) -> SkyMap:
+        """The maps without the light of the candidates."""
+        return replace(self, snr=self.noise)
+
+    def without(self, places: Sequence[Image]) -> SkyMap:
+        """Maps without peaks at places (2,), which have the shape of the noise's correlation."""
+        snr, sky = self.snr.copy(), self.on_sky(self.grid)
+        # The image of a source in a map of S/N is the autocorrelation of its noise, and that is
+        # exp(-d L d / 2) with the curvature L.
+        for place in places:
+            away = sky - place
+            shape = np.exp(-np.einsum("...i,ij,...j", away, self.curvature, away) / 2)
+            snr = snr - float(self.at(place)[0]) * shape
+        return replace(self, snr=snr)
 
     def on_sky(self, offsets: Image) -> Image:
         """East and north of positions x, y from the star on the frame, (..., 2), arcsec."""
@@ -135,16 +156,18 @@ class SkyMap:
         return Positions(np.zeros((0, 2)), np.zeros((0, 2, 2)), self.north)._to_sky
 
     @cached_property
-    def _splines(self) -> tuple[Image, Image]:
-        """Coefficients of the S/N, and of the Gaussian standard deviations that are as rare."""
-        sigmas = self.snr
-        if np.isfinite(self.freedom).any():
-            tail = stats.t.sf(np.abs(self.snr), self.freedom)
-            # Beyond the smallest numbers Student's t does not differ from a Gaussian.
-            equivalent = np.where(tail > 0, stats.norm.isf(tail), np.abs(self.snr))
-            sigmas = np.copysign(equivalent, self.snr)
+    def _splines(self) -> tuple[Image, ...]:
+        """Coefficients of the S/N, and of the Gaussian standard deviations if they differ."""
         first = spline_filter(self.snr, order=_ORDER)
-        return first, first if sigmas is self.snr else spline_filter(sigmas, order=_ORDER)
+        if not np.isfinite(self.freedom).any():
+            return (first,)
+        return first, spline_filter(_gaussian(self.snr, self.freedom), order=_ORDER)
+
+    def _freedom_at(self, place: Image) -> float:
+        """Degrees of freedom in the pixel of a place, (2,)."""
+        columns, rows = np.rint(pixels_of(self.grid, place @ self._turn)).astype(int)
+        ny, nx = self.freedom.shape
+        return float(self.freedom[np.clip(rows, 0, ny - 1), np.clip(columns, 0, nx - 1)])
 
     @cached_property
     def _information(self) -> Image:
@@ -164,25 +187,17 @@ class SkyMap:
         pixel = [rows, columns]
         information = map_coordinates(self._information, pixel, order=1, mode="nearest")
         known = inside & (information > 0)
-        snr, sigmas = (
+        values = [
             np.where(
                 known,
                 map_coordinates(each, pixel, order=_ORDER, mode="mirror", prefilter=False),
                 0.0,
             )
             for each in self._splines
-        )
+        ]
+        snr, sigmas = values[0], values[-1]
         error = np.where(known, np.where(known, information, 1.0) ** -0.5, np.inf)
         return snr.reshape(shape), sigmas.reshape(shape), error.reshape(shape)
-
-    def fitted_at(self, place: Image) -> tuple[float, float, float]:
-        """As `at`, at one place, (2,), with what a fit of the reduction's own candidate adds."""
-        snr, sigmas, error = (float(each) for each in self.at(place))
-        away = np.hypot(*(self.fitted[:, :2] - place).T)
-        if not len(away) or away.min() > self.resolution / 2 or not math.isfinite(error):
-            return snr, sigmas, error
-        _, _, missing, ratio = self.fitted[int(np.argmin(away))]
-        return (snr * error + float(missing)) / (error * float(ratio)), sigmas, error * float(ratio)
 
     @cached_property
     def curvature(self) -> NDArray[np.float64]:
@@ -236,21 +251,27 @@ class SkyStack:
         scales: Mapping[str, float],
         places: Image,
         moves: Mapping[str, Image],
-        *,
-        fitted: bool = False,
     ) -> SkyStack:
-        """Add maps at places, (..., 2), each moved by its own offset (2,).
+        """Add maps at places, (..., 2), each moved by its own offset (2,)."""
+        values = {each.name: each.at(places + moves[each.name]) for each in maps}
+        return cls.of_values(maps, filters, scales, values)
 
-        With `fitted`, at one place, what fits of candidates say is used, see `SkyMap.fitted_at`.
-        """
-        shape = (len(filters), *places.shape[:-1])
+    @classmethod
+    def of_values(
+        cls,
+        maps: Sequence[SkyMap],
+        filters: Sequence[str],
+        scales: Mapping[str, float],
+        values: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]],
+    ) -> SkyStack:
+        """Add what maps say, as `SkyMap.at` does, (...) each, by the name of the map."""
+        shape = (len(filters), *np.shape(next(iter(values.values()))[0]))
         information, snr, sigmas = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         curvature = np.zeros((len(filters), 2, 2))
         for each in maps:
             # The mean flux with weights 1 / e^2 has the S/N sum(S/N_k / e_k) / sqrt(sum 1 / e_k^2).
             k = filters.index(each.filter)
-            moved = places + moves[each.name]
-            own_snr, own_sigmas, error = each.fitted_at(moved) if fitted else each.at(moved)
+            own_snr, own_sigmas, error = (np.asarray(value) for value in values[each.name])
             root = 1 / (error * scales[each.name])
             information[k] += root**2
             snr[k] += root * own_snr
@@ -286,6 +307,19 @@ class SkyStack:
         return np.where(information > 0, information, np.nan) ** -0.5
 
 
+def _gaussian(snr: Image, freedom: ArrayLike) -> Image:
+    """Gaussian standard deviations that are as rare as an S/N, which follows Student's t."""
+    height, freedom = np.abs(snr), np.asarray(freedom, dtype=float)
+    with np.errstate(divide="ignore"):
+        exact = stats.norm.isf(stats.t.sf(height, freedom))
+    # Beyond the smallest numbers, within 0.01: D. L. Wallace, Annals of Mathematical Statistics 30,
+    # 1121 (1959).
+    few = np.where(np.isfinite(freedom), freedom, 1.0)
+    rare = (8 * few + 1) / (8 * few + 3) * np.sqrt(few * np.log1p(height**2 / few))
+    rare = np.where(np.isfinite(freedom), rare, height)
+    return np.asarray(np.copysign(np.where(np.isfinite(exact), exact, rare), snr))
+
+
 def date_of(epoch: Sequence[SkyMap]) -> float:
     """Mean date of maps, MJD."""
     return float(np.mean([each.mjd for each in epoch]))
@@ -312,230 +346,52 @@ def common_grid(maps: Sequence[SkyMap]) -> Image:
     return np.stack(np.meshgrid(axis[::-1], axis), axis=-1)
 
 
-# What several epochs say of a source: it moves with the star, stays on the sky, or neither.
-
-POSITION = 0.003
-"""Error of positions of different reductions beyond that of the noise, arcsec: orientation,
-distortion, and where the star is behind the mask."""
-
-_WANDER = 0.003
-"""Standard deviation of a background source's own proper motion, arcsec per year: that of stars
-at a few kpc. Galaxies have none."""
-
-YEAR = 365.25
-"""Days."""
-
-_L2 = 1.01
-"""Distance of the telescope from the Sun over that of the Earth."""
-
-_CLEAR = 0.99
-"""Probability of a hypothesis from which it is stated as the verdict."""
-
-_SAMPLES = 600
-"""Number of places about the expected one, and about the highest peak within its reach."""
+_FINEST, _COARSEST = 33, 201
+"""Smallest and largest number of places on a side of the square over which a likelihood is
+integrated."""
 
 
-@dataclass(frozen=True)
-class Motion:
-    """How places of sources move between epochs."""
-
-    proper: tuple[float, float]  # Proper motion of the star to the east and north, arcsec per year.
-    parallax: float = 0.0  # arcsec; 0 if it is not known.
-    # Right ascension and declination of the star, degrees.
-    coordinates: tuple[float, float] | None = None
-    mass: float = 1.0  # Of the star, in solar masses.
-
-    def background(self, before: float, after: float) -> NDArray[np.float64]:
-        """How far a source at infinity moves from the star between two dates (MJD), (2,), arcsec.
-
-        It is opposite to the star's proper motion and parallax.
-        """
-        moved = np.array(self.proper) * (after - before) / YEAR
-        if self.parallax > 0 and self.coordinates is not None:
-            moved = moved + self.parallax * (self._factors(after) - self._factors(before))
-        return -moved
-
-    def _factors(self, mjd: float) -> NDArray[np.float64]:
-        """Parallax factors to the east and north, (2,)."""
-        earth = get_body_barycentric("earth", Time(mjd, format="mjd")).xyz.to_value("AU") * _L2
-        ra, dec = np.deg2rad(self.coordinates or (0.0, 0.0))
-        east = np.array([np.sin(ra), -np.cos(ra), 0.0])
-        north = np.array([np.cos(ra) * np.sin(dec), np.sin(ra) * np.sin(dec), -np.cos(dec)])
-        return np.array([east @ earth, north @ earth])
-
-    def orbital(self, separation: ArrayLike) -> NDArray[np.float64]:
-        """Speed of a circular orbit at projected separations, arcsec per year; 0 if not known.
-
-        A bound companion moves by at most the square root of two times that.
-        """
-        distance = np.maximum(np.asarray(separation, dtype=float), 1e-3)
-        if self.parallax <= 0:
-            return np.zeros_like(distance)
-        au = distance / self.parallax
-        return np.asarray(2 * math.pi * np.sqrt(self.mass / au) * self.parallax)
-
-
-@dataclass(frozen=True)
-class Hypotheses:
-    """Probabilities of three hypotheses about a source, given its places at several epochs.
-
-    Attributes
-    ----------
-    bound, background, neither : float
-        Probabilities, if all three were equally probable before. A bound source moves by no more
-        than an orbit allows; one in the background stays on the sky; the third is of a source that
-        does neither, or is seen at one epoch only.
-    ln_ratio : float
-        Logarithm of the evidence of the first over that of the second.
-    """
-
-    bound: float
-    background: float
-    neither: float
-    ln_ratio: float
-
-    @property
-    def verdict(self) -> str:
-        """The hypothesis with a probability of 99 % or more, in words."""
-        if self.bound >= _CLEAR:
-            return "moves with the star"
-        if self.background >= _CLEAR:
-            return "stays on the sky: a source in the background"
-        if self.neither >= _CLEAR:
-            return "neither moves with the star nor stays on the sky"
-        return "not decided"
-
-
-def hypotheses(
+def ln_likelihood_ratio(
     maps: Sequence[SkyMap],
-    flux: Mapping[str, float],
-    place: ArrayLike,
-    reference: float,
-    motion: Motion,
-    *,
-    seed: int = 0,
-) -> Hypotheses:
-    """Compare three hypotheses on the motion of a source, with its flux marginalised.
+    place: Image,
+    covariance: Image,
+    fluxes: Mapping[str, tuple[float, float]],
+    resolution: float,
+) -> float:
+    """Logarithm of the likelihood of maps with a source, over the likelihood without it.
 
-    `maps` are of two epochs or more; `flux` has the contrast of the source by the name of the map,
-    up to a common factor, and `place` (2,) east and north of the star at the epoch `reference`,
-    MJD, arcsec.
+    The source is at a place (2,) with a covariance (2, 2), arcsec^2, and `fluxes` are its contrast
+    and the error by filter; filters in which they are not known say nothing. `resolution` is
+    lambda/D, arcsec. Outside the field both likelihoods are one.
     """
-    place = np.asarray(place, dtype=float)
-    # The likelihood of the data is integrated over the flux F, which is the same at all epochs,
-    # over the place at the reference epoch, and over the places at the others that a hypothesis
-    # allows. At a place, with numerator a and information b of the amplitude of the spectrum, it is
-    # exp(F a - F^2 b / 2) times that without a source. A peak of S/N s in noise with the curvature
-    # L is known to 1 / (s sqrt(L)) in each direction.
-    epochs = epochs_of(maps)
-    nearest = min(epochs, key=lambda each: abs(date_of(each) - reference))
-    own, others = nearest, [each for each in epochs if each is not nearest]
-    here_a, here_b = _evidence_terms(own, flux, place)
-    snr = max(float(here_a / np.sqrt(here_b)) if here_b > 0 else 0.0, 1.0)
-    curvature = float(np.mean([np.trace(each.curvature) / 2 for each in own]))
-    width = 1 / (snr * math.sqrt(curvature))
-    steps = width * np.linspace(-4, 4, 17)
-    places = place + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    a, b = _evidence_terms(own, flux, places)
-    highest = (snr + 6) / max(float(here_b), 1e-300) ** 0.5
-    levels = highest * (np.arange(120) + 0.5) / 120
-    # (levels, places); the flux prior is the same for all hypotheses.
-    first = levels[:, None] * a - levels[:, None] ** 2 * b / 2
-    logs = {"bound": first, "background": first, "neither": first}
-    rng = np.random.default_rng(seed)
-    for epoch in others:
-        date = date_of(epoch)
-        years = abs(date - date_of(own)) / YEAR
-        orbital = float(motion.orbital(np.hypot(*place))) / math.sqrt(2)
-        spreads = {
-            "bound": (np.zeros(2), math.hypot(orbital * years, math.sqrt(2) * POSITION)),
-            "background": (
-                motion.background(date_of(own), date),
-                math.hypot(_WANDER * years, math.sqrt(2) * POSITION),
-            ),
-        }
-        for name, (moved, spread) in spreads.items():
-            logs[name] = logs[name] + _at_other_epoch(
-                epoch, flux, levels, places, place + moved, moved, spread, width, rng
-            )
-        logs["neither"] = logs["neither"] + _anywhere(epoch, flux, levels)[:, None]
-    evidence = {name: float(logsumexp(each)) for name, each in logs.items()}
-    norm = float(logsumexp(list(evidence.values())))
-    probabilities = {name: math.exp(each - norm) for name, each in evidence.items()}
-    return Hypotheses(**probabilities, ln_ratio=evidence["bound"] - evidence["background"])
-
-
-def _at_other_epoch(
-    epoch: Sequence[SkyMap],
-    flux: Mapping[str, float],
-    levels: Image,
-    places: Image,
-    centre: Image,
-    moved: Image,
-    spread: float,
-    width: float,
-    rng: np.random.Generator,
-) -> Image:
-    """Logarithm of the likelihood of an epoch, averaged over places, (levels, places)."""
-    # Importance sampling: with samples from a density q, the average of the likelihood over the
-    # density p of places is the mean of likelihood p / q. Half of the samples are about the
-    # expected place, half about the highest peak within its reach, and q is the mean of both
-    # densities.
-    wide = math.hypot(spread, width)
-    samples = centre + wide * rng.normal(size=(_SAMPLES, 2))
-    a, b = _evidence_terms(epoch, flux, samples)
-    snr = np.divide(a, np.sqrt(b), out=np.zeros_like(a), where=b > 0)
-    near = separation_of(samples - centre) < 3.5 * wide
-    peak = samples[int(np.argmax(np.where(near, snr, -np.inf)))]
-    peak, height = maximum(lambda place: signal(epoch, flux, place), peak, width)
-    height = max(height, 1.0)
-    curvature = float(np.mean([np.trace(each.curvature) / 2 for each in epoch]))
-    narrow = 1.2 / (height * math.sqrt(curvature))
-    samples = np.concatenate([samples, peak + narrow * rng.normal(size=(_SAMPLES, 2))])
-    a, b = _evidence_terms(epoch, flux, samples)
-    log_density = np.logaddexp(
-        _log_normal(samples - centre, wide), _log_normal(samples - peak, narrow)
-    ) - math.log(2)
-    light = levels[:, None] * a - levels[:, None] ** 2 * b / 2
-    prior = _log_normal(places[:, None] + moved - samples, spread) - log_density
-    # exp of a sum, by a product of matrices that are scaled to their largest element.
-    top, most = light.max(axis=1, keepdims=True), prior.max(axis=1, keepdims=True)
-    mean = np.exp(light - top) @ np.exp(prior - most).T / len(samples)
-    return np.asarray(np.log(np.maximum(mean, 1e-300)) + top + most.T)
-
-
-def _log_normal(away: Image, deviation: float) -> Image:
-    square = (away**2).sum(axis=-1) / deviation**2
-    return np.asarray(-square / 2 - math.log(2 * math.pi * deviation**2))
-
-
-def _anywhere(epoch: Sequence[SkyMap], flux: Mapping[str, float], levels: Image) -> Image:
-    """Logarithm of the likelihood of an epoch where the source is absent, or at any place, (l,).
-
-    Either has the probability one half.
-    """
-    grid = epoch[0].on_sky(epoch[0].grid)
-    a, b = _evidence_terms(epoch, flux, grid[::2, ::2].reshape(-1, 2))
-    light = levels[:, None] * a - levels[:, None] ** 2 * b / 2
-    return np.asarray(np.logaddexp(0.0, logsumexp(light, axis=1) - math.log(len(a))) - math.log(2))
-
-
-def _evidence_terms(
-    epoch: Sequence[SkyMap], flux: Mapping[str, float], places: Image
-) -> tuple[Image, Image]:
-    """Numerator and information of the amplitude of a spectrum at places, (...) each."""
-    a, b = np.zeros(places.shape[:-1]), np.zeros(places.shape[:-1])
-    for each in epoch:
-        snr, _, error = each.at(places)
-        a += flux[each.name] * snr / error
-        b += (flux[each.name] / error) ** 2
-    return a, b
-
-
-def signal(epoch: Sequence[SkyMap], flux: Mapping[str, float], place: Image) -> float:
-    """S/N of a source with fluxes by the name of the map, at a place, (2,)."""
-    a, b = _evidence_terms(epoch, flux, place)
-    return float(a / np.sqrt(b)) if b > 0 else 0.0
+    # A map with the S/N z and the error e of the contrast has, with a source of the flux F, the
+    # likelihood exp(a F - b F^2 / 2) relative to none, a = z / e, b = 1 / e^2. With F = f +- s,
+    #
+    #     log integral = (2 a f + a^2 s^2 - b f^2) / (2 (1 + b s^2)) - log(1 + b s^2) / 2,
+    #
+    # and its exponential is averaged over the places.
+    shown = [each for each in maps if each.filter in fluxes]
+    if not shown:
+        return 0.0
+    squares, axes = np.linalg.eigh(covariance)
+    deviations = np.sqrt(np.maximum(squares, 0))
+    side = np.clip(math.ceil(8 * deviations.max() / (resolution / 6)), _FINEST, _COARSEST)
+    steps = np.linspace(-4, 4, int(side))
+    standard = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    places = place + (standard * deviations) @ axes.T
+    weights = np.exp(-(standard**2).sum(axis=1) / 2)
+    logs = np.zeros(len(places))
+    for name in dict.fromkeys(each.filter for each in shown):
+        flux, error = fluxes[name]
+        a, b = np.zeros(len(places)), np.zeros(len(places))
+        for each in shown:
+            if each.filter == name:
+                snr, _, own = each.at(places)
+                a += snr / own
+                b += own**-2.0
+        spread = 1 + b * error**2
+        logs += (2 * a * flux + (a * error) ** 2 - b * flux**2) / (2 * spread) - np.log(spread) / 2
+    return float(logsumexp(logs, b=weights / weights.sum()))
 
 
 def maximum(height: Callable[[Image], float], start: Image, step: float) -> tuple[Image, float]:
@@ -562,10 +418,11 @@ def maximum(height: Callable[[Image], float], start: Image, step: float) -> tupl
 class Family:
     """Spectra (k, filters) that are searched together; None for any without negative fluxes.
 
-    The stack (filters, n) is at the pixels of the field, and `area` that of one, arcsec^2.
+    The stack (filters, n) is at the pixels of the field, and `area` is the area of a pixel, or of
+    each (n,), arcsec^2, times the number of maps of noise that are searched there.
     """
 
-    def __init__(self, spectra: Image | None, stack: SkyStack, area: float) -> None:
+    def __init__(self, spectra: Image | None, stack: SkyStack, area: float | Image) -> None:
         self.spectra = spectra
         root = area * np.ones(stack.error.shape[1])
         if spectra is None:
@@ -591,6 +448,18 @@ class Family:
             return np.asarray(np.sqrt((np.maximum(stack.sigmas, 0) ** 2).sum(axis=0)))
         weights = stack.weights(self.spectra)
         return np.asarray(np.einsum("kf...,f...->k...", weights, stack.sigmas).max(axis=0))
+
+    def best(self, stack: SkyStack) -> int:
+        """The number of the most significant spectrum at a place; 0 for free fluxes."""
+        if self.spectra is None:
+            return 0
+        return int(np.argmax(stack.weights(self.spectra) @ stack.sigmas))
+
+    def snr(self, stack: SkyStack, number: int) -> float:
+        """S/N of a spectrum, or of free fluxes, at a place."""
+        if self.spectra is None:
+            return float(np.sqrt((np.maximum(stack.snr, 0) ** 2).sum()))
+        return float(stack.weights(self.spectra[[number]])[0] @ stack.snr)
 
     def expected(self, level: float) -> float:
         """Upper bound of the expected number of maxima of noise above a level."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from pyklip_diffrender.instrument.jwst import jwst_pupil, maskbar_openings, mask
 from pyklip_diffrender.instrument.masks import BarMask, DetectorPlace, detector_place, require_mask
 from pyklip_diffrender.instrument.spectrum import filter_bandpass, filter_throughput
 from pyklip_diffrender.io.files import embedded_table
-from pyklip_diffrender.io.units import Bound, to_metres, to_number, to_pair
+from pyklip_diffrender.io.units import Bound, require_shape, to_metres, to_number, to_pair
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, noll_indices, samples_for_field
 from pyklip_diffrender.optics.planes import (
@@ -32,6 +33,7 @@ from pyklip_diffrender.optics.planes import (
     Plane,
 )
 from pyklip_diffrender.optics.system import OpticalSystem, Value
+from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 
 __all__ = [
     "FLIGHT_ALIGNMENT",
@@ -309,6 +311,14 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
         ("bar_reach", u.arcsec, "positive"),
         ("chromatic_reference", u.m, "positive"),
     )
+    for name in ("npix", "nlambda", "oversample"):
+        value = recipe[name]
+        whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if value is not None and not (whole and value >= 1):
+            raise IncompatibleSetupError(
+                f"{name}: got {value!r}, expected a whole number, 1 or more"
+            )
+    recipe["shear"] = to_number(recipe["shear"], "", "shear")
     for name, unit, bound in bounds:
         if recipe[name] is not None:
             recipe[name] = to_number(recipe[name], unit, name, bound)
@@ -318,7 +328,14 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
         recipe["source"] = to_number(recipe["source"], u.K, "source", "positive")
     if not isinstance(recipe["si_wfe"], bool | Tensor):
         recipe["si_wfe"] = to_metres(recipe["si_wfe"], "si_wfe")
+        require_shape(recipe["si_wfe"], (36,), "si_wfe", "Noll coefficients from piston on")
     recipe["defaults"] = dict(recipe["defaults"] or {})  # The caller may change theirs.
+    unknown = sorted(set(recipe["defaults"]) - {each.name for each in OPTICAL_PARAMETERS})
+    if unknown:
+        raise IncompatibleSetupError(
+            f"defaults: got {', '.join(unknown)}, expected some of "
+            f"{', '.join(each.name for each in OPTICAL_PARAMETERS)}"
+        )
     return recipe
 
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from io import BytesIO
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy import constants
 from astropy import units as u
-from astropy.io import fits
+from astropy.io import ascii, fits
 from astropy.io.votable import parse_single_table
 from astropy.modeling.physical_models import BlackBody
-from astropy.table import Table
+from astropy.table import Column, Table
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import (
@@ -25,24 +28,29 @@ from pyklip_diffrender.errors import (
     DiffrenderError,
     IncompatibleSetupError,
     MissingFileError,
+    UnitError,
 )
-from pyklip_diffrender.io.files import embedded_table, is_fits_name, open_fits, read_text
-from pyklip_diffrender.io.units import native_float64, to_metres, to_number, to_unit
+from pyklip_diffrender.io.files import embedded_table, open_fits, read_bytes
+from pyklip_diffrender.io.units import native_float64, to_metres, to_number, to_unit, unit_of
 from pyklip_diffrender.optics.bandpass import Bandpass
 
 __all__ = [
     "TEMPERATURES",
     "PlanetSpectra",
     "blackbody",
-    "dwarf_photometry",
     "filter_bandpass",
     "filter_throughput",
-    "is_dwarf",
     "mean_in_filter",
     "planet_spectra",
     "read_spectrum",
+    "require_star",
     "star_flux_density",
 ]
+
+
+_log = logging.getLogger(__name__)
+
+_Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @lru_cache(maxsize=1)
@@ -144,22 +152,8 @@ _END = 5.2e-6
 """Wavelength to which the spectrum is continued, m, as the power law from W1 to W2."""
 
 
-def is_dwarf(star: str) -> bool:
-    """True for a spectral type and a K magnitude, such as "A2V, K=6.77"."""
-    return _DESCRIPTION.fullmatch(star) is not None
-
-
-def dwarf_photometry(star: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Samples of the spectrum of a dwarf, wavelengths in m and flux densities in Jy.
-
-    `star` has a spectral type from B5 to M9 and the magnitude in Ks, such as "A2V, K=6.77".
-    IncompatibleSetupError for another description, or a type that the table does not have.
-    """
-    match = _DESCRIPTION.fullmatch(star)
-    if match is None:
-        raise IncompatibleSetupError(
-            f'star: got {star!r}, expected a spectral type and a K magnitude such as "A2V, K=6.77"'
-        )
+def _dwarf(match: re.Match[str]) -> _Spectrum:
+    """Samples of the spectrum of a dwarf from B5 to M9, m and Jy."""
     table = embedded_table("dwarf_colors")
     places = native_float64([_place(each) for each in table["type"]])
     place = _place(match["type"])
@@ -168,9 +162,10 @@ def dwarf_photometry(star: str) -> tuple[NDArray[np.float64], NDArray[np.float64
             f"star: got type {match['type']}, expected {table['type'][0]} to {table['type'][-1]}"
         )
     # W1 - W2 is interpolated from K5 to M5, between which the table has no value.
+    colours = [native_float64(table[name]) for name in ("j_h", "h_ks", "ks_w1", "w1_w2")]
     j_h, h_ks, ks_w1, w1_w2 = (
-        _interpolated(place, places, native_float64(table[name]))
-        for name in ("j_h", "h_ks", "ks_w1", "w1_w2")
+        float(np.interp(place, places[np.isfinite(each)], each[np.isfinite(each)]))
+        for each in colours
     )
     ks = float(match["magnitude"])
     magnitudes = native_float64([ks + h_ks + j_h, ks + h_ks, ks, ks - ks_w1, ks - ks_w1 - w1_w2])
@@ -186,11 +181,6 @@ def _place(name: str) -> float:
     return 10.0 * "BAFGKM".index(name[0]) + float(name[1:])
 
 
-def _interpolated(place: float, places: NDArray[np.float64], colours: NDArray[np.float64]) -> float:
-    known = np.isfinite(colours)
-    return float(np.interp(place, places[known], colours[known]))
-
-
 # Flux density of a star in a filter, from its spectrum, its photometry or its spectral type.
 
 _GAP = 1.6
@@ -199,8 +189,6 @@ continuum of a star. Infrared photometry has points at 2.16, 3.35, 4.60 and 11.6
 
 _RANGE = (2e-6, 5.2e-6)
 """Wavelengths, m, at which the samples have to be as close as that."""
-
-_Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
@@ -213,8 +201,12 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
     Parameters
     ----------
     star : path or str
-        File with the spectrum, see `read_spectrum`; or spectral type of a dwarf (B5 to M9) and its
-        2MASS Ks magnitude, such as "A2V, K=6.77". From the type, the flux is good to about 5 %.
+        File with the spectrum or photometry: a table in text (also CSV, ECSV, CDS and IPAC), FITS
+        or VOTable, gzipped or not. Units are those of the columns, or stand in their names
+        ("flux_mJy") or in comments ("# ANGSTROM FLAM"); without any, they are micron and Jy, and a
+        warning is logged. Columns of errors are left out.
+        Or spectral type of a dwarf (B5 to M9) and its 2MASS Ks magnitude, such as "A2V, K=6.77".
+        From the type, the flux is good to about 5 %.
     filter : str
         Such as "F444W".
 
@@ -226,7 +218,8 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
     Raises
     ------
     IncompatibleSetupError
-        For an unknown filter, or a spectrum that does not cover it.
+        For an unknown filter, a spectrum that does not cover it, columns or units that are
+        ambiguous, and numbers that cannot be true.
     CorruptFileError
         If the file cannot be read.
     FileNotFoundError
@@ -234,14 +227,14 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
 
     Examples
     --------
-    A spectrum as spaceKLIP's ``starfile`` has it, micron and Jy:
+    The spectrum of a file:
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
     >>> import pyklip_diffrender as dr
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder, "star.txt")
-    ...     _ = path.write_text("3.0 0.9\n4.0 0.5\n5.0 0.3\n6.0 0.2\n")
+    ...     _ = path.write_text("# um Jy\n3.0 0.9\n4.0 0.5\n5.0 0.3\n6.0 0.2\n")
     ...     print(dr.star_flux_density(path, "F444W").round(3))
     0.411 Jy
 
@@ -250,7 +243,8 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
     >>> print(dr.star_flux_density("A2V, K=6.77", "F444W").round(3))
     0.378 Jy
     """
-    grid, flux = dwarf_photometry(str(star)) if is_dwarf(str(star)) else read_spectrum(star)
+    dwarf = _DESCRIPTION.fullmatch(str(star))
+    grid, flux = read_spectrum(star) if dwarf is None else _dwarf(dwarf)
     return mean_in_filter(grid, flux, filter, str(star)) * u.Jy
 
 
@@ -279,43 +273,33 @@ def mean_in_filter(
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
-    """Read a spectrum: wavelengths, m, increasing, and flux densities, Jy.
+    """Read the spectrum of a star: wavelengths, m, increasing, and flux densities, Jy.
 
-    - A text file of two columns without units: wavelength in micron and flux density in Jy, as
-      the ``starfile`` of spaceKLIP. Lines that begin with ``#`` are comments.
-    - A table with units (ECSV, FITS), whose first two columns are wavelengths or frequencies,
-      and flux densities by wavelength or frequency, such as the spectra of CALSPEC.
-    - Photometry as the VizieR photometry viewer saves it (VOTable with ``sed_freq`` and
-      ``sed_flux``). Points at one frequency are averaged by their median.
+    See `star_flux_density` for the files. Of several columns that are no errors, the flux density
+    is the one called "flux", or the only one with such a unit. Samples at one wavelength are
+    averaged by their median.
 
-    FileNotFoundError if there is no such file, CorruptFileError if it is not one of these, or has
-    no positive flux, IncompatibleSetupError if its samples between 2 and 5.2 micron are too far
-    apart for interpolation.
+    MissingFileError if there is no such file, CorruptFileError if it is no table or has no positive
+    flux, IncompatibleSetupError if columns or units are ambiguous or cannot be true, or if samples
+    between 2 and 5.2 micron are too far apart for interpolation.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: no such file; expected a star's spectrum or "
-            'photometry, or a spectral type and a K magnitude such as "A2V, K=6.77"'
-        )
-    suffix = path.suffix.lower()
-    is_photometry = suffix in (".vot", ".xml", ".votable")
-    try:
-        wavelength, flux = _photometry(path) if is_photometry else _table(path, suffix)
-    except (OSError, ValueError, TypeError, KeyError, IndexError, StopIteration) as error:
-        raise CorruptFileError(
-            f"{path}: not a spectrum ({error}). Expected two columns, wavelength in micron and "
-            "flux density in Jy, a table with units, or a VOTable of VizieR's photometry viewer"
-        ) from error
-    usable = np.isfinite(wavelength) & np.isfinite(flux) & (wavelength > 0) & (flux > 0)
-    if usable.sum() < 2:
-        raise CorruptFileError(
-            f"{path}: {int(usable.sum())} of {len(flux)} samples are positive numbers, expected "
-            "at least two"
-        )
-    wavelength, which = np.unique(wavelength[usable], return_inverse=True)
-    flux = flux[usable]
-    flux = native_float64([np.median(flux[which == k]) for k in range(len(wavelength))])
+    axis, others = _columns(
+        path,
+        "a star's spectrum or photometry, or a spectral type and a K magnitude such as "
+        '"A2V, K=6.77"',
+    )
+    possible = [each for each in others if each.unit is None or _is(each.unit, _DENSITIES)]
+    named = [each for each in possible if re.match(r"(?i)(sed_)?flux(?![a-z])", each.name)]
+    with_unit = [each for each in possible if each.unit is not None]
+    level = next((group[0] for group in (named, possible, with_unit) if len(group) == 1), None)
+    if level is None or (axis.unit is None) != (level.unit is None):
+        expected = "one column of flux densities" if level is None else "units of both, or of none"
+        raise _unclear(path, [axis, *others], expected)
+    if level.unit is None:
+        _log.warning("%s has no units; micron and Jy are assumed", path)
+    wavelength, flux = _samples(path, axis, level)
+    require_star(np.interp(_REFERENCE, wavelength, flux), f"{path}: {level.name}")
     used = (wavelength[1:] > _RANGE[0]) & (wavelength[:-1] < _RANGE[1])
     step = np.where(used, np.diff(wavelength) / wavelength[:-1], 0.0)
     if step.max() > _GAP:
@@ -327,47 +311,217 @@ def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
     return wavelength, flux
 
 
-def _photometry(path: Path) -> _Spectrum:
-    """Points of VizieR's photometry viewer, m and Jy."""
-    with warnings.catch_warnings():
-        # VizieR's files deviate from the standard in ways that do not concern these columns.
-        warnings.simplefilter("ignore")
-        table = parse_single_table(path).to_table()
-    frequency = u.Quantity(np.ma.filled(table["sed_freq"], np.nan), table["sed_freq"].unit or u.GHz)
-    flux = u.Quantity(np.ma.filled(table["sed_flux"], np.nan), table["sed_flux"].unit or u.Jy)
-    wavelength = frequency.to_value(u.m, u.spectral())
-    return native_float64(wavelength), native_float64(flux.to_value(u.Jy))
+def require_star(jansky: float, name: str) -> None:
+    """Raise IncompatibleSetupError for a flux density, Jy, that no star has in the filters."""
+    others = ("uJy", "W / (m2 um)", "erg / (s cm2 Angstrom)", "erg / (s cm2 Hz)")
+    _require_overlap((jansky, jansky), _STARS, "Jy", others, name)
 
 
-def _table(path: Path, suffix: str) -> _Spectrum:
-    """Samples of a table, m and Jy; columns without units are in micron and Jy."""
-    units: list[Any] = [None, None]
-    if is_fits_name(path):
+def _require_overlap(
+    found: tuple[float, float],
+    expected: tuple[float, float],
+    unit: str,
+    others: Sequence[str],
+    name: str,
+) -> None:
+    """Raise IncompatibleSetupError for numbers out of a range, with units that may be meant."""
+    equivalences = u.spectral() + u.spectral_density(_REFERENCE * u.m)
+
+    def overlaps(other: str) -> bool:
+        low, high = (found * u.Unit(other)).to_value(unit, equivalences)
+        return bool(low <= expected[1] and high >= expected[0])
+
+    if not overlaps(unit):
+        meant = " or ".join(filter(overlaps, others))
+        raise IncompatibleSetupError(
+            f"{name}: got {' to '.join(dict.fromkeys(map('{:.4g}'.format, found)))} {unit}, "
+            f"expected {expected[0]:g} to {expected[1]:g} {unit}. "
+            + (f"In {meant} it would be plausible" if meant else "Check its unit")
+        )
+
+
+# Tables of spectra, whose units are written in many places.
+
+_STARS = (1e-6, 1e5)
+"""Flux densities of stars from 2 to 5.2 micron, Jy: the brightest is R Doradus with 3e4 Jy, and
+1e-6 Jy is the AB magnitude 24."""
+
+_REFERENCE = 3.2e-6
+"""Wavelength in the middle of the filters, m."""
+
+_AXES = ("length", "frequency", "wavenumber")
+_DENSITIES = (
+    "spectral flux density", "spectral flux density wav",
+    "photon flux density", "photon flux density wav",
+)  # fmt: skip
+_BRIGHTNESSES = ("surface brightness", "surface brightness wav")
+"""Physical types of units."""
+
+_IS_AXIS = re.compile(r"(?i)(sed_)?(wave|freq|(w|wl|wvl|lam|lambda|nu)(?![a-z]))")
+"""Beginning of the name of a column of wavelengths or frequencies."""
+
+_IS_ERROR = re.compile(
+    r"(?i)(^|[^a-z]|flux|stat|sys)(err|errors?|unc|uncertaint(y|ies)|sigma|std|rms|noise|snr)"
+    r"($|[^a-z])|^[ed]_|^(sed_)?[ed](f|flux)($|[^a-z])"
+)
+"""Part of the name, the description or the UCD of a column of errors."""
+
+_NAME = re.compile(r"[^\s,;|()\[\]]+(?:\s*(?:\((?:[^()]|\([^()]*\))*\)|\[[^\]]*\]))?")
+"""Name of a column in a comment, with the unit in brackets."""
+
+
+def _is(unit: u.UnitBase | None, kinds: Sequence[str]) -> bool:
+    return unit is not None and any(unit.physical_type == kind for kind in kinds)
+
+
+def _unclear(path: Path, columns: Sequence[Column], expected: str) -> IncompatibleSetupError:
+    listed = ", ".join(f"{each.name} ({each.unit or 'no unit'})" for each in columns)
+    return IncompatibleSetupError(
+        f"{path}: got the columns {listed or 'without numbers'}; expected {expected}. Name the "
+        'columns with their units, as a text does that begins with "# wave_um flux_mJy"'
+    )
+
+
+def _columns(path: Path, expected: str) -> tuple[Column, list[Column]]:
+    """Wavelengths or frequencies, and the other columns of numbers, without errors.
+
+    The unit of a column is None if the file does not say it.
+    """
+    if not path.is_file():
+        raise MissingFileError(f"{path}: no such file; expected {expected}")
+    try:
+        with warnings.catch_warnings():
+            # Of units, which are judged here, and of deviations from the standard of VOTables.
+            warnings.simplefilter("ignore")
+            table, comments = _table(path)
+            if not len(table):
+                raise ValueError("it has no rows")
+            columns = [
+                Column(native_float64(each), each.info.name, unit=_unit_of(each))
+                for each in table.columns.values()
+                if each.dtype.kind in "fiu" and each.ndim == 1 and not _is_error(each)
+            ]
+            mentioned = [_unit_in(name) for line in comments for name in _NAME.findall(line)]
+    except UnitError as error:
+        raise IncompatibleSetupError(f"{path}: {error}") from error
+    except DiffrenderError:
+        raise
+    except (OSError, EOFError, ValueError, TypeError, KeyError, IndexError) as error:
+        reason = (
+            "" if isinstance(error, ascii.InconsistentTableError | IndexError) else f" ({error})"
+        )
+        raise CorruptFileError(
+            f"{path}: not a table of numbers{reason}; expected wavelengths and flux densities in "
+            "columns of text, with # before each comment, of FITS or of a VOTable"
+        ) from error
+    named = [each for each in columns if _IS_AXIS.match(each.name)]
+    spectral = [each for each in columns if _is(each.unit, _AXES)]
+    first = [each for each in columns[:1] if each.unit is None]
+    group = next((each for each in (named, spectral, first) if each), [])
+    if len(group) != 1:
+        raise _unclear(path, columns, "one column of wavelengths")
+    axis = group[0]
+    for each in columns:
+        kinds = _AXES if each is axis else (*_DENSITIES, *_BRIGHTNESSES)
+        units = [unit for unit in mentioned if _is(unit, kinds)]
+        if each.unit is None and units:
+            if any(unit != units[0] for unit in units):
+                listed = ", ".join(map(str, units))
+                raise _unclear(path, columns, f"one such unit in the comments, not {listed}")
+            each.unit = units[0]
+    if axis.unit is None:
+        if re.match(r"(?i)(sed_)?(freq|nu)", axis.name):
+            raise _unclear(path, columns, "a unit of frequencies")
+        _require_overlap(
+            (np.nanmin(axis), np.nanmax(axis)), (1e6 * _RANGE[0], 1e6 * _RANGE[1]), "micron",
+            ("Angstrom", "nm", "m"), f"{path}: {axis.name}, which has no unit",
+        )  # fmt: skip
+    return axis, [each for each in columns if each is not axis]
+
+
+def _table(path: Path) -> tuple[Table, list[str]]:
+    """Table of a file, whose kind its content tells, and the comments above it."""
+    content = read_bytes(path)
+    if content.startswith(b"SIMPLE"):
         with open_fits(path) as hdus:
-            table = next(hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU))
-            place, level = (native_float64(table.data.field(k)) for k in (0, 1))
-            units = [column.unit for column in table.columns[:2]]
-    elif suffix == ".ecsv":
-        columns = [Table.read(read_text(path), format="ascii.ecsv").columns[k] for k in (0, 1)]
-        place, level = (native_float64(np.ma.filled(each, np.nan)) for each in columns)
-        units = [each.unit for each in columns]
-    else:
-        place, level = np.loadtxt(read_text(path).splitlines(), ndmin=2, usecols=(0, 1)).T
-    wavelength = u.Quantity(place, _unit(units[0], u.micron)).to(u.m, u.spectral())
-    flux = u.Quantity(level, _unit(units[1], u.Jy)).to(u.Jy, u.spectral_density(wavelength))
-    return native_float64(wavelength.value), native_float64(flux.value)
+            tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+            if not tables:
+                raise ValueError("the FITS file has no table")
+            table = Table.read(tables[0])
+            if table.colnames == ["WAVELENGTH", "target"]:
+                # lineplot_target.fits of the JWST ETC has a unit of wavelengths only.
+                table["target"].unit = "mJy"
+            return table, []
+    if b"<VOTABLE" in content[:4096]:
+        return parse_single_table(BytesIO(content)).to_table(use_names_over_ids=True), []
+    lines = content.decode("utf-8-sig").splitlines()
+    if lines and lines[0].startswith("# %ECSV"):
+        return ascii.read(lines, format="ecsv"), []
+    above = list(takewhile(lambda line: not line.strip() or line.lstrip().startswith("#"), lines))
+    table = ascii.read(lines[len(above) :])
+    comments = [line.strip("# \t") for line in above]
+    if table.colnames[0] == "col1":
+        for line in comments:
+            names = _NAME.findall(line)
+            if (
+                len(names) == len(table.columns)
+                and any(_IS_AXIS.match(each) or _is(_unit_in(each), _AXES) for each in names)
+                and not re.search("[:=]", line)
+            ):
+                table.rename_columns(table.colnames, names)
+                return table, [each for each in comments if each != line]
+    return table, comments
 
 
-def _unit(unit: Any, default: u.UnitBase) -> u.UnitBase:
-    """Unit of a column; spectra of CALSPEC write theirs as ANGSTROMS and FLAM."""
-    if unit is None:
-        return default
-    text = str(unit).strip().lower()
-    if text == "angstroms":
-        return u.AA
-    if text == "flam":
-        return u.erg / (u.s * u.cm**2 * u.AA)
-    return u.Unit(unit)
+def _is_error(column: Any) -> bool:
+    texts = (column.info.name, column.info.description, column.info.meta)
+    return any(_IS_ERROR.search(str(each or "")) for each in texts)
+
+
+def _unit_of(column: Any) -> u.UnitBase | None:
+    own = str(column.unit or "")
+    return (unit_of(own) or u.UnrecognizedUnit(own)) if own else _unit_in(column.info.name)
+
+
+def _unit_in(name: str) -> u.UnitBase | None:
+    """Unit in the name of a column, or in a word of a comment."""
+    if re.match(r"(?i)log(10)?[_( ]", name):
+        return u.UnrecognizedUnit("logarithm")
+    bracket = re.search(r"[\[(](.+)[\])]$", name)
+    starts = [0, *(each.end() for each in re.finditer(r"[\s_/]+", name))]
+    for text in [name, bracket[1]] if bracket else [name[start:] for start in starts]:
+        # A letter is a unit only of wavelengths: "flux_A" may be the flux of star A.
+        unit = unit_of(text) if bracket or len(text) > 1 or _IS_AXIS.match(name) else None
+        # Parsecs are no unit of wavelengths.
+        far = unit is not None and unit.is_equivalent(u.m) and unit > u.m
+        if _is(unit, (*_AXES, *_DENSITIES, *_BRIGHTNESSES)) and not far:
+            return unit
+    if bracket:
+        return u.UnrecognizedUnit(bracket[1])
+    return u.mag if re.search(r"(?i)mag(nitude)?s?(?![a-z])", name) else None
+
+
+def _samples(path: Path, axis: Column, level: Column) -> _Spectrum:
+    """Wavelengths, m, increasing, and flux densities, Jy, or Jy/sr for surface brightnesses."""
+    x, y = native_float64(axis), native_float64(level)
+    usable = np.isfinite(x) & np.isfinite(y) & (x > 0)
+    wavelength = (x[usable] * (axis.unit or u.micron)).to(u.m, u.spectral())
+    # Shifted, not multiplied, because units of magnitudes take no product.
+    unit = level.unit or u.Jy
+    levels = y[usable] << (unit * u.sr if _is(unit, _BRIGHTNESSES) else unit)
+    flux = native_float64(levels.to_value(u.Jy, u.spectral_density(wavelength)))
+    usable = np.isfinite(flux) & (flux > 0)
+    if usable.sum() < 2:
+        raise CorruptFileError(
+            f"{path}: {int(usable.sum())} of {len(y)} samples of {level.name} are positive "
+            "numbers, expected at least two"
+        )
+    order = np.argsort(wavelength.value[usable], kind="stable")
+    flux = flux[usable][order]
+    grid, first = np.unique(wavelength.value[usable][order], return_index=True)
+    if len(grid) < len(flux):
+        flux = native_float64([np.median(each) for each in np.split(flux, first[1:])])
+    return grid, flux
 
 
 # Spectra of planets in the filters of a search: black bodies, model atmospheres, a flat one.
@@ -402,10 +556,9 @@ def planet_spectra(
     ----------
     spectra : str, path, or sequence of them
         "blackbody" (150 to 1,500 K), "flat" (the same flux density per frequency at all
-        wavelengths), or the file of a table whose first column is a wavelength and whose other
-        columns are spectra, each named by its column: ECSV or FITS with units, or text whose first
-        line has the names, with wavelengths in micron and flux densities per frequency. Only the
-        shape of a spectrum matters.
+        wavelengths), or the file of a table, as `star_flux_density` reads it. Every column of flux
+        densities, or of surface brightnesses, is a spectrum with the name of the column. Without
+        units, wavelengths are in micron and spectra per frequency. Only their shape matters.
     filters : sequence of str
         Such as "F444W".
 
@@ -430,96 +583,49 @@ def planet_spectra(
     [[0.014, 1.0], [1.0, 1.0]]
     """
     requests = [spectra] if isinstance(spectra, str | os.PathLike) else list(spectra)
-    names: list[str] = []
-    rows: list[NDArray[np.float64]] = []
+    rows: list[tuple[str, list[float]]] = []
     left_out: list[tuple[str, str]] = []
     for request in requests:
         if request == "flat":
-            names.append("flat")
-            rows.append(np.ones(len(filters)))
+            rows.append(("flat", [1.0] * len(filters)))
         elif request == "blackbody":
+            frequency = u.Quantity(_SAMPLES, u.m).to(u.Hz, u.spectral())
             for temperature in TEMPERATURES:
-                names.append(f"black body of {temperature} K")
-                frequency = u.Quantity(_SAMPLES, u.m).to(u.Hz, u.spectral())
+                name = f"black body of {temperature} K"
                 flux = native_float64(BlackBody(temperature * u.K)(frequency).value)
-                rows.append(_in_filters(_SAMPLES, flux, filters, names[-1]))
+                rows.append(
+                    (name, [mean_in_filter(_SAMPLES, flux, each, name) for each in filters])
+                )
         else:
-            _add_file(Path(request), filters, names, rows, left_out)
-    flux = np.array(rows).reshape(-1, len(filters))
-    return PlanetSpectra(
-        tuple(names), tuple(filters), flux / flux.max(axis=1, keepdims=True), tuple(left_out)
-    )
+            found, lost = _spectra_in_file(Path(request), filters)
+            rows += found
+            left_out += lost
+    flux = np.array([row for _, row in rows]).reshape(-1, len(filters))
+    names = tuple(name for name, _ in rows)
+    largest = flux.max(axis=1, keepdims=True)
+    return PlanetSpectra(names, tuple(filters), flux / largest, tuple(left_out))
 
 
-def _add_file(
-    path: Path,
-    filters: Sequence[str],
-    names: list[str],
-    rows: list[NDArray[np.float64]],
-    left_out: list[tuple[str, str]],
-) -> None:
-    """Append the spectra of a file to the names and rows, or to what is left out."""
-    wavelength, columns = _read(path)
-    before = len(names)
-    for name, flux in columns.items():
-        usable = np.isfinite(wavelength) & (wavelength > 0) & np.isfinite(flux) & (flux > 0)
-        if usable.sum() < 2:
-            left_out.append((name, "fewer than two samples are positive numbers"))
-            continue
-        order = np.argsort(wavelength[usable])
-        grid, values = wavelength[usable][order], flux[usable][order]
+def _spectra_in_file(
+    path: Path, filters: Sequence[str]
+) -> tuple[list[tuple[str, list[float]]], list[tuple[str, str]]]:
+    """Names of the spectra and their means in filters; names of what is left out, and why."""
+    axis, columns = _columns(path, '"blackbody", "flat", "free", or a table of spectra')
+    units = [each.unit for each in columns if each.unit is not None]
+    rows, left_out = [], []
+    for each in columns:
         try:
-            rows.append(_in_filters(grid, values, filters, name))
-        except IncompatibleSetupError as error:
-            left_out.append((name, str(error)))
-            continue
-        names.append(name)
-    if len(names) == before:
+            if units and not _is(each.unit, (*_DENSITIES, *_BRIGHTNESSES)):
+                raise _unclear(path, [each], "flux densities")
+            grid, flux = _samples(path, axis, each)
+            rows.append(
+                (each.name, [mean_in_filter(grid, flux, name, each.name) for name in filters])
+            )
+        except (CorruptFileError, IncompatibleSetupError) as error:
+            left_out.append((each.name, str(error)))
+    if not rows:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out)
         raise IncompatibleSetupError(
             f"{path}: none of its spectra can be used ({reasons or 'it has a single column'})"
         )
-
-
-def _in_filters(
-    grid: NDArray[np.float64], flux: NDArray[np.float64], filters: Sequence[str], name: str
-) -> NDArray[np.float64]:
-    return np.array([mean_in_filter(grid, flux, each, name) for each in filters])
-
-
-def _read(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Wavelengths, m, and flux densities per frequency by the name of their column."""
-    if not path.is_file():
-        raise MissingFileError(
-            f'{path}: no such file; expected "blackbody", "flat", "free", or a table of spectra'
-        )
-    try:
-        forms = {".ecsv": "ascii.ecsv", ".fits": "fits", ".csv": "ascii.csv"}
-        table = Table.read(path, format=forms.get(path.suffix.lower(), "ascii.commented_header"))
-        first = table.columns[0]
-        place = u.Quantity(native_float64(first), first.unit or u.micron)
-        wavelength = place.to(u.m, u.spectral())
-        spectra = {}
-        for column in table.columns[1:].values():
-            flux = native_float64(column)
-            if column.unit is not None:
-                flux = _per_frequency(flux * column.unit, wavelength)
-            spectra[str(column.name)] = flux
-    except (DiffrenderError, FileNotFoundError):
-        raise
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        raise CorruptFileError(
-            f"{path}: not a table of spectra ({error}). Expected wavelengths in the first column "
-            "(micron, or with a unit) and a spectrum in each of the others; in a text file, the "
-            "first line has the names after #"
-        ) from error
-    return native_float64(wavelength.value), spectra
-
-
-def _per_frequency(flux: u.Quantity, wavelength: u.Quantity) -> NDArray[np.float64]:
-    """Flux density, or surface brightness of the planet, per frequency, up to a constant."""
-    per_area = flux.unit.is_equivalent(u.Jy / u.sr) or flux.unit.is_equivalent(
-        u.W / (u.m**3 * u.sr)
-    )
-    flux = flux * u.sr if per_area else flux
-    return native_float64(flux.to_value(u.Jy, u.spectral_density(wavelength)))
+    return rows, left_out

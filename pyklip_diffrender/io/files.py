@@ -12,7 +12,7 @@ import shutil
 import warnings
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -27,20 +27,26 @@ from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
     ExistingFileError,
+    IncompatibleSetupError,
     MissingFileError,
 )
 
 __all__ = [
     "BROKEN",
+    "OutputFolder",
     "embedded_table",
     "fits_files",
     "is_fits_name",
+    "moved_aside",
     "open_fits",
+    "product_in",
+    "read_bytes",
     "read_image",
     "read_text",
     "replacing",
     "require_new",
     "sha256",
+    "stamps",
     "unpacked_name",
     "without_fits_suffix",
     "write_fits",
@@ -90,9 +96,33 @@ def fits_files(folder: str | os.PathLike[str]) -> list[Path]:
     )
 
 
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Content of a file, or of what is in a gzipped one."""
+    with _unpacked(Path(path)) as file:
+        return file.read()
+
+
 def read_text(path: str | os.PathLike[str]) -> str:
     """Text of a file in UTF-8, with or without the byte-order mark that editors on Windows add."""
     return Path(path).read_text(encoding="utf-8-sig")
+
+
+_PRODUCTS = {
+    "INITIAL_OPD": "a fit",
+    "RESIDUAL_SNR": "a search",
+    "PATTERN": "a flat-field pattern",
+}
+"""Extensions by which products of this package are known, whose headers are those of frames."""
+
+
+def product_in(hdus: fits.HDUList) -> str:
+    """Which product of this package an open file is, such as "a fit"; empty if it is none."""
+    header = hdus[0].header
+    if "PATVERS" in header:
+        return "a library of flat-field patterns"
+    names = [hdu.name for hdu in hdus]
+    known = (what for name, what in _PRODUCTS.items() if name in names)
+    return next(known, "an image" if "DRVERS" in header else "")
 
 
 @contextmanager
@@ -255,8 +285,135 @@ def require_new(paths: Iterable[str | os.PathLike[str]], overwrite: bool) -> Non
     if existing and not overwrite:
         verb = "exists" if len(existing) == 1 else "exist"
         raise ExistingFileError(
-            f"{', '.join(existing)} {verb}; choose another place, or replace with overwrite=True"
+            f"{', '.join(existing)} {verb}; choose another place, or replace with the option "
+            "overwrite"
         )
+
+
+class OutputFolder:
+    """A folder for the products of a run, in which those of other runs are kept.
+
+    With `overwrite` a run may replace the products that are in the folder when it begins. What
+    somebody else writes there until it ends is not replaced: the products of the run then go to a
+    new folder inside, which is on the same disk and can be written to.
+
+    Parameters
+    ----------
+    folder : path
+    products : callable
+        Returns the files in a folder that are called like products.
+    overwrite : bool
+
+    Attributes
+    ----------
+    asked : Path
+        The folder that was asked for.
+    folder : Path
+        The folder that is written to.
+
+    Raises
+    ------
+    ExistingFileError
+        If there are products, and `overwrite` is False.
+    IncompatibleSetupError
+        If the folder is a file.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        products: Callable[[Path], Iterable[Path]],
+        *,
+        overwrite: bool,
+    ) -> None:
+        self.asked = self.folder = Path(folder)
+        if self.folder.exists() and not self.folder.is_dir():
+            raise IncompatibleSetupError(f"output: {folder} is a file, expected a folder")
+        self._products = products
+        require_new(products(self.folder), overwrite)
+        # The products that may be replaced, as they are now.
+        self._known = stamps(products(self.folder))
+
+    def place(self) -> Path:
+        """Return the folder to write to now: a new one if somebody else has written to this one."""
+        found = stamps(self._products(self.folder))
+        if any(self._known.get(path) != stamp for path, stamp in found.items()):
+            self.folder, self._known = _new_folder_in(self.asked), {}
+        return self.folder
+
+    def clear(self, keep: Iterable[Path] = ()) -> None:
+        """Remove the products that may be replaced, apart from some to `keep`."""
+        found, kept = stamps(self._known), set(keep)
+        for path, stamp in self._known.items():
+            if path not in kept and found.get(path) == stamp:
+                path.unlink()
+        self._known = stamps(kept)
+
+    def replace(self, write: Callable[[Path], Iterable[Path]]) -> list[Path]:
+        """Put new products in place of the earlier ones, all of them or none.
+
+        `write` writes them to the folder that it is given, and returns their paths.
+
+        Warns
+        -----
+        DiffrenderWarning
+            If they are not where they were asked for.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        staged = self.folder / f".{secrets.token_hex(8)}"
+        staged.mkdir()
+        before = self.folder
+        try:
+            names = [path.relative_to(staged) for path in write(staged)]
+            place = self.place()
+            for name in names:
+                (place / name).parent.mkdir(exist_ok=True)
+                _move(staged / name, place / name)
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)
+        written = [place / name for name in names]
+        self.clear(keep=written)
+        if place != before:
+            warnings.warn(moved_aside(self.asked, place), DiffrenderWarning, stacklevel=3)
+        return written
+
+
+def moved_aside(asked: object, used: object) -> str:
+    """Say which folders products were meant for, and which they are in."""
+    return (
+        f"somebody else has written products to {asked} while this run was computing: these are "
+        f"kept, and the products of this run are in {used}"
+    )
+
+
+def stamps(paths: Iterable[Path]) -> dict[Path, tuple[int, int]]:
+    """Times (ns) and sizes of the files that exist, which tell whether one was replaced."""
+    stamps = {}
+    for path in paths:
+        with suppress(FileNotFoundError):
+            state = path.stat()
+            stamps[path] = (state.st_mtime_ns, state.st_size)
+    return stamps
+
+
+def _new_folder_in(folder: Path) -> Path:
+    """Make a folder in another one, called like it with the first number from 2 that is free."""
+    number = 2
+    while True:
+        path = folder / f"{folder.absolute().name}-{number}"
+        try:
+            path.mkdir()
+        except FileExistsError:
+            number += 1
+        else:
+            return path
+
+
+def _move(source: Path, path: Path) -> None:
+    """Replace a file in one step; the new one has the permissions of the old one, if there is."""
+    if path.exists():
+        shutil.copymode(path, source)
+    os.replace(source, path)
 
 
 @contextmanager
@@ -274,9 +431,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary.touch(exist_ok=False)
     try:
         yield temporary
-        if path.exists():
-            shutil.copymode(path, temporary)
-        os.replace(temporary, path)
+        _move(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -27,6 +27,8 @@ __all__ = [
     "header_date",
     "header_number",
     "header_text",
+    "known_number",
+    "known_text",
     "merged_header",
     "same_name",
     "sensing_date",
@@ -171,6 +173,24 @@ def header_text(header: fits.Header, key: str, name: str) -> str | None:
     if value is not None and not isinstance(value, str):
         raise card_error(name, key, value, "text")
     text = (value or "").strip()
+    return None if text.upper() in _UNKNOWN else text
+
+
+def known_number(header: fits.Header, key: str) -> float | None:
+    """Finite number of a card; None if it holds anything else.
+
+    For what is only told, and must not end a reduction; `header_number` is for what counts.
+    """
+    try:
+        return header_number(header, key, "")
+    except CorruptFileError:
+        return None
+
+
+def known_text(header: fits.Header, key: str) -> str | None:
+    """Text of a card, also of a number; None if it is missing, or says that it is not known."""
+    value = _value(header, key)
+    text = "" if value is None else str(value).strip()
     return None if text.upper() in _UNKNOWN else text
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
@@ -20,7 +20,6 @@ __all__ = [
     "heard_by",
     "heartbeat",
     "numbered_stages",
-    "progressed",
     "stage",
 ]
 
@@ -28,8 +27,8 @@ _log = logging.getLogger(__name__)
 
 _STAGE: ContextVar[str] = ContextVar("stage", default="")
 
-_SCHEDULE: ContextVar[_Schedule | None] = ContextVar("schedule", default=None)
-"""None where stages are not numbered."""
+_NUMBERS: ContextVar[Iterator[int] | None] = ContextVar("numbers", default=None)
+"""Numbers of the next stages; None where they are not numbered."""
 
 _LISTENER: ContextVar[Callable[[str], None] | None] = ContextVar("listener", default=None)
 
@@ -50,85 +49,15 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
 
 
-@dataclass
-class _Schedule:
-    """Stages and how long they take, compared with what was expected."""
-
-    expected: dict[str, float]  # s, of stages that have not begun, by name
-    count: int = 0  # of stages that have begun
-    _own: float = 0.0  # expected duration of the present stage, s
-    _began: float = field(default_factory=time.monotonic)
-    _done: float = 0.0  # expected duration of the stages that have ended, s
-    _spent: float = 0.0  # what these have taken, s
-    _part: float = 0.0
-    _part_spent: float = 0.0
-
-    def begin(self, name: str) -> str:
-        """Begin a stage; its name with its number."""
-        self.count += 1
-        self._own, self._began = self.expected.pop(name, 0.0), time.monotonic()
-        self._part = 0.0
-        return f"{self.count}. {name}"
-
-    def end(self) -> None:
-        """End the stage: the next estimates are by the speed of all stages that were expected."""
-        if self._own:
-            self._done += self._own
-            self._spent += time.monotonic() - self._began
-        self._own = 0.0
-
-    def progressed(self, part: float) -> None:
-        """Note that a part of the stage is done: the next estimates are by its speed as well."""
-        self._part, self._part_spent = part, time.monotonic() - self._began
-
-    @property
-    def left(self) -> str:
-        """Time that this stage and the next ones take, as far as they were expected."""
-        if not (self._own or self.expected):
-            return ""
-        # `pace` is the time that things take over the time that was expected.
-        spent, later = time.monotonic() - self._began, sum(self.expected.values())
-        pace = self._spent / self._done if self._done else 1.0
-        if self._part > 0:
-            # By the speed of what is done of this stage, which is a large one.
-            pace = self._part_spent / (self._own * self._part) if self._own else pace
-            # What was expected of the rest, at that pace, less what has passed since the part was
-            # noted.
-            rest = (self._own * (1 - self._part) + later) * pace - (spent - self._part_spent)
-            return f", about {duration(max(rest, later * pace))} left"
-        if not self._own:
-            return f", about {duration(later * pace)} left"
-        if spent <= self._own * pace:
-            return f", about {duration((self._own + later) * pace - spent)} left"
-        if not later:
-            return ""
-        # This stage takes longer than expected, and so may the next ones.
-        pace = (self._spent + spent) / (self._done + self._own)
-        return f", more than {duration(later * pace)} left"
-
-
 @contextmanager
-def numbered_stages(expected: Mapping[str, float] | None = None) -> Iterator[None]:
-    """Number the stages inside from 1, unless they are part of stages that are numbered.
-
-    With `expected` durations of stages (s, by name), messages say how much time is left, by the
-    speed of the stages that have ended.
-    """
-    token = None
-    if _SCHEDULE.get() is None:
-        token = _SCHEDULE.set(_Schedule(dict(expected or {})))
+def numbered_stages() -> Iterator[None]:
+    """Number the stages inside from 1, unless they are part of stages that are numbered."""
+    token = _NUMBERS.set(itertools.count(1)) if _NUMBERS.get() is None else None
     try:
         yield
     finally:
         if token is not None:
-            _SCHEDULE.reset(token)
-
-
-def progressed(part: float) -> None:
-    """Note that a part of the current stage, from 0 to 1, is done, for estimates of the time."""
-    schedule = _SCHEDULE.get()
-    if schedule is not None:
-        schedule.progressed(part)
+            _NUMBERS.reset(token)
 
 
 @contextmanager
@@ -149,11 +78,6 @@ def heartbeat(say: Callable[[], str]) -> Iterator[None]:
         thread.join()
 
 
-def _left() -> str:
-    schedule = _SCHEDULE.get()
-    return "" if schedule is None else schedule.left
-
-
 @contextmanager
 def heard_by(listener: Callable[[str], None]) -> Iterator[None]:
     """Call a function with the name of every stage inside, besides the log."""
@@ -167,11 +91,11 @@ def heard_by(listener: Callable[[str], None]) -> Iterator[None]:
 @contextmanager
 def stage(name: str) -> Iterator[None]:
     """Name what is being done, such as "wavefront", for bars inside and for the log."""
-    schedule = _SCHEDULE.get()
-    if schedule is not None:
-        name = schedule.begin(name)
+    numbers = _NUMBERS.get()
+    if numbers is not None:
+        name = f"{next(numbers)}. {name}"
     token = _STAGE.set(name)
-    _log.info("%s%s", name, _left())
+    _log.info("%s", name)
     listener = _LISTENER.get()
     if listener is not None:
         listener(name)
@@ -179,8 +103,6 @@ def stage(name: str) -> Iterator[None]:
         yield
     finally:
         _STAGE.reset(token)
-        if schedule is not None:
-            schedule.end()
 
 
 class ProgressBar:
@@ -220,7 +142,6 @@ class ProgressBar:
         """Count steps, and show values such as ``chi2=4.1`` beside the name."""
         self._steps += steps
         text = ", ".join([self._name, *(f"{key} {value:.3g}" for key, value in values.items())])
-        text += "" if self._nested else _left()
         self._bar.set_description_str(text, refresh=False)
         self._bar.update(steps)
         if not self._nested and time.monotonic() - self._logged >= _INTERVAL:

@@ -8,6 +8,7 @@ unit of most containers. Inputs are never modified.
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from typing import Any, Literal, TypeVar
 
@@ -42,6 +43,7 @@ __all__ = [
     "to_number",
     "to_pair",
     "to_unit",
+    "unit_of",
     "warn_of_rms",
 ]
 
@@ -179,6 +181,53 @@ def _converted(
         raise UnitError(
             f"{name}: got the unit '{own}', expected one that converts to '{unit}'"
         ) from error
+
+
+_SPELLINGS = {
+    "Angstrom": "a aa ang angstrom angstroms",
+    "um": "um micron microns micrometer micrometers micrometre micrometres",
+    "nm": "nm nanometer nanometers nanometre nanometres",
+    "cm": "cm", "m": "m", "s": "s sec", "erg": "erg ergs", "W": "w watt watts",
+    "Hz": "hz hertz", "GHz": "ghz", "THz": "thz", "Jy": "jy jansky janskys",
+    "photon": "ph photon photons",
+    "erg s-1 cm-2 Angstrom-1": "flam", "erg s-1 cm-2 Hz-1": "fnu",
+    "photon s-1 cm-2 Angstrom-1": "photlam", "photon s-1 cm-2 Hz-1": "photnu",
+}  # fmt: skip
+"""Units as files of spectra spell them, such as those of synphot, in capitals or not."""
+
+_SPELLED = {
+    word: unit
+    for unit, words in _SPELLINGS.items()
+    for each in words.split()
+    for word in (each, each.upper(), each.capitalize())
+} | {"mjy": "mJy"}
+
+
+def unit_of(text: str) -> u.UnitBase | None:
+    """Unit in any spelling that files of spectra have; None if the text is no unit.
+
+    "A" is Angstrom, "S" the second, and "4.4um" a value. UnitError for "MJY", mJy or MJy.
+    """
+    text = text.strip(" []")
+    # Also without "mag": astropy's AB is a flux density, of magnitude 0.
+    system = re.fullmatch(r"(?i)(?:mag)?[\s_]*\(?(ab|st)\)?[\s_]*(?:mag)?", text)
+    if system:
+        return u.ABmag if system[1].upper() == "AB" else u.STmag
+    words = r"(?<![\d.])[^\W\d_]+"
+    text = re.sub(words, lambda word: _SPELLED.get(word[0], word[0]), text)
+    if re.search(r"\bMJY\b", text):
+        raise UnitError(f"got the unit {text!r}, expected mJy or MJy, in upper and lower case")
+    known = u.get_current_unit_registry().registry
+    scaled = re.match(r"[\d.]", text) and not re.match(r"1[eE]|10[-+*^]", text)
+    if scaled or not all(word in known for word in re.findall(words, text)):
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", u.UnitsWarning)  # Of several slashes.
+        for form in ("generic", "fits"):
+            unit = u.Unit(text, format=form, parse_strict="silent") if text else None
+            if unit is not None and not isinstance(unit, u.UnrecognizedUnit):
+                return unit
+    return None
 
 
 def to_mask(value: Any, name: str) -> NDArray[np.bool_]:

@@ -223,6 +223,7 @@ class Propagation:
                 raise TypeError(f"{name!r} is not a parameter of this system: {self.parameters}")
             if not isinstance(value, Tensor):
                 value = to_unit(value, parameter(name).unit, name)
+                require_finite(value, name)
             tensor = torch.as_tensor(value, dtype=torch.float64).to(self.device)
             tensor = tensor.reshape(1) if tensor.ndim == 0 else tensor
             if tensor.shape[-1] != parameter(name).size:

@@ -15,8 +15,8 @@ from astropy.time import Time
 from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift
 
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.files import open_fits, product_in
 from pyklip_diffrender.io.headers import same_name
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -26,14 +26,15 @@ from pyklip_diffrender.pattern.library import (
     known_systematics,
     package_library,
 )
-from pyklip_diffrender.pattern.measure import flat_of, lacks_pattern, measure_patterns
+from pyklip_diffrender.pattern.measure import lacks_pattern, measure_patterns
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.admission import epochs_of
+from pyklip_diffrender.scene.exposure import detector_of, flat_field_of, image_mask
 from pyklip_diffrender.scene.jwst_files import shift_frames, shift_variances
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.systematics import Systematics, shows_star
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = [
@@ -222,19 +223,43 @@ class PatternChoice:
         return ", ".join(f"{origin} ({', '.join(names)})" for origin, names in parts if names)
 
     @property
-    def has_other_flat_field(self) -> bool:
-        """Whether the frames were calibrated with another flat field than those of the library.
+    def of_other_flat_field(self) -> Observation | None:
+        """The first frame that was calibrated with another flat field than the pattern's, if any.
 
-        They may show its pattern nevertheless, or the headers may not say.
+        It may show the pattern nevertheless. For a library's pattern, a frame that does not say its
+        flat field is one, too.
         """
-        if self.origin != "library":
-            return False
-        own, known = flat_of(self.science[0]), self.library.matching(self.science[0])
-        return own is None or any(pattern.flat != own for pattern in known)
+        if self.origin == "library":
+            known = {each.flat for each in self.library.matching(self.science[0])}
+            return next((e for e in self.science if None in known or known != {_flat(e)}), None)
+        if self.origin == "given" and self.systematics is not None:
+            stated = {self.systematics.flat, None}
+            if len(stated) > 1:
+                return next((each for each in self.science if _flat(each) not in stated), None)
+        return None
 
     def is_refuted_by(self, fit: Refinement) -> bool:
-        """Whether a fit shows less than half of the library's pattern; for any, the log warns."""
-        return lacks_pattern(fit) and self.origin == "library"
+        """Whether a fit shows less than half of a library's pattern; for any, the log warns.
+
+        Raises IncompatibleSetupError for a pattern that was given.
+        """
+        if not lacks_pattern(fit):
+            return False
+        if self.origin == "given":
+            assert self.systematics is not None
+            own = sorted({_flat(each) or "not stated" for each in self.science})
+            raise IncompatibleSetupError(
+                f"systematics: {fit.frames[0].observation.name} shows less than half of the "
+                f"pattern {self.systematics.name!r}. Flat field of the frames: {', '.join(own)}; "
+                f"of the pattern: {self.systematics.flat or 'not stated'}. Give a pattern of "
+                "frames that were calibrated alike, or 'auto'"
+            )
+        return self.origin == "library"
+
+
+def _flat(observation: Observation) -> str | None:
+    """Name of the flat field of the calibration."""
+    return flat_field_of(observation.header, observation.name)
 
 
 def as_request(systematics: object) -> PatternRequest:
@@ -252,6 +277,12 @@ def as_request(systematics: object) -> PatternRequest:
             if path.is_file():
                 with open_fits(path) as hdus:
                     is_library = "PATVERS" in hdus[0].header
+                    what = product_in(hdus) or "no product of pyklip_diffrender"
+                    if not is_library and ("INITIAL_OPD" in hdus or "PATTERN" not in hdus):
+                        raise CorruptFileError(
+                            f"{path.name}: this is {what}, expected a flat-field pattern, such as "
+                            "a systematics.fits, or a library of them"
+                        )
                 return PatternLibrary.read(path) if is_library else Systematics.read(path)
     raise IncompatibleSetupError(
         f"systematics: got {systematics!r}, expected 'auto', 'references', 'off', a Systematics, a "
@@ -293,6 +324,14 @@ def choose_systematics(
     known = PatternLibrary()
     if systematics == "off":
         origin = "off"
+    if pattern is not None and pattern.first_pixel is not None and pattern.pattern.any():
+        name = pattern.name
+        science, pattern = _registered(science, pattern, model, opd, common)
+        if pattern is None:
+            raise IncompatibleSetupError(
+                f"systematics: the pattern {name!r} is not seen in these frames, whose "
+                "files do not say which pixels of the detector they show. Give 'auto'"
+            )
     if systematics != "off" and not isinstance(systematics, Systematics):
         first = science[0]
         known = _library(systematics) if library else PatternLibrary()
@@ -331,7 +370,10 @@ def pattern_for_visit(
     # A pattern that was learned from one of the fitted stars would count its frames twice: the
     # pattern of other stars is taken, or else one of unknown values that frames of the same pixels
     # share.
-    if choice.origin in ("off", "given"):
+    given = choice.systematics if choice.origin == "given" else None
+    if choice.origin == "off" or (
+        given is not None and not any(shows_star(given, each) for each in references)
+    ):
         return choice.systematics
     if is_known_beside(choice, references):
         own = {each.target for each in references}
@@ -346,12 +388,7 @@ def pattern_for_visit(
         if known is not None:
             return known
     first = science[0]
-    alike = [
-        each
-        for each in references
-        if each.first_pixel == first.first_pixel and each.shape == first.shape
-    ]
-    return _unknown_pattern([*science, *alike])
+    return _unknown_pattern([*science, *(each for each in references if _alike(each, first))])
 
 
 def is_known_beside(choice: PatternChoice, references: Sequence[Observation]) -> bool:
@@ -395,9 +432,7 @@ def _limited(
 def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
     """Return a pattern of which only the size is known, if rolls tell it from a planet."""
     first = science[0]
-    same = all(
-        each.first_pixel == first.first_pixel and each.shape == first.shape for each in science
-    )
+    same = all(_alike(each, first) for each in science)
     # Files of one roll, such as the segments of an exposure, show a planet on the same pixels.
     # Frames of another star do not show it at all.
     turned = any(abs(each.roll_from(first)) > _TURNED or each.reference for each in science)
@@ -413,6 +448,9 @@ def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
         pedestal=_TYPICAL_PEDESTAL if first.unit == u.MJy / u.sr else 0.0,
         first_pixel=first.first_pixel,
         filter=first.filter,
+        image_mask=image_mask(first.header, first.name),
+        detector=detector_of(first.header, first.name),
+        flat=_flat(first),
         name="the rolls themselves",
     )
 
@@ -421,15 +459,24 @@ def _with_the_flat_of(
     first: Observation, references: Sequence[Observation]
 ) -> tuple[list[Observation], list[tuple[str, str]]]:
     """Frames that show the pattern of a frame; also the stars of the others, and why."""
-    own, kept, failed = flat_of(first), list[Observation](), list[tuple[str, str]]()
+    own, kept, failed = _flat(first), list[Observation](), list[tuple[str, str]]()
     for each in references:
-        flat = flat_of(each)
+        flat = _flat(each)
         if None in (own, flat) or flat == own:
             kept.append(each)
         else:
             reason = f"calibrated with the flat field {flat} (R_FLAT), the target with {own}"
             failed.append((each.target, reason))
     return kept, list(dict.fromkeys(failed))
+
+
+def _alike(one: Observation, other: Observation) -> bool:
+    """Whether two frames have the same pixels and the same error of the flat field."""
+    return (one.first_pixel, one.shape, _flat(one)) == (
+        other.first_pixel,
+        other.shape,
+        _flat(other),
+    )
 
 
 def _fit_references(
@@ -494,16 +541,16 @@ def _rough_fit(
     )
 
 
-def is_refuted_by_first_frame(
-    choice: PatternChoice, model: OpticalSystem, opd: OPDMap, *, progress: bool = False
+def is_refuted_by_frame(
+    choice: PatternChoice, frame: Observation, model: OpticalSystem, opd: OPDMap
 ) -> bool:
-    """Whether the first frame alone shows less than half of the library's pattern."""
+    """Whether a frame alone shows less than half of the pattern, see `is_refuted_by`."""
     rough = _rough_fit(
         model,
-        choice.science[0],
+        frame,
         opd,
         settings=choice.settings,
-        progress=progress,
+        progress=False,
         systematics=choice.systematics,
     )
     return rough.status.usable and choice.is_refuted_by(rough)
@@ -530,16 +577,17 @@ def fit_with_pattern(
     """Choose a pattern and fit the target; once more without the library if it is refuted.
 
     `fit` fits with a choice; its second argument is True without the library. `options` are those
-    of `choose_systematics`, of which this also raises the errors. The choice is that of the last
-    fit.
+    of `choose_systematics`, of which this also raises the errors, and IncompatibleSetupError for a
+    pattern that was given and is refuted. The choice is that of the last fit.
     """
     # Only a fit can tell that frames which were calibrated with another flat field do not have the
-    # library's pattern. Where the headers make that likely, the first frame is asked before all are
+    # known pattern. Where the headers make that likely, one of these frames is asked before all are
     # fitted: its rough fit takes a tenth of the time of two rolls'.
     choice = choose_systematics(science, references, model, opd, **options)
-    if choice.has_other_flat_field:
-        with stage("pattern of the library in the first frame"):
-            is_refuted = is_refuted_by_first_frame(choice, model, opd)
+    frame = choice.of_other_flat_field
+    if frame is not None:
+        with stage(f"flat-field pattern in {frame.name}"):
+            is_refuted = is_refuted_by_frame(choice, frame, model, opd)
         if is_refuted:
             choice = choose_systematics(science, references, model, opd, library=False, **options)
     result = fit(choice, False)

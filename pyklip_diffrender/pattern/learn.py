@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy import units as u
+from astropy.io.fits import Header
 from astropy.table import QTable
-from numpy.typing import NDArray
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import (
@@ -27,11 +28,11 @@ from pyklip_diffrender.io.headers import same_name, unknown_name
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.pattern.library import PatternLibrary, known_systematics
 from pyklip_diffrender.pattern.measure import (
-    flat_of,
     measure_patterns,
     pattern_pedestal,
     pattern_size,
 )
+from pyklip_diffrender.refinement.fit_file import encoded
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
@@ -43,7 +44,7 @@ from pyklip_diffrender.scene.admission import (
     frames_by_star,
     require_some,
 )
-from pyklip_diffrender.scene.exposure import detector_of, image_mask
+from pyklip_diffrender.scene.exposure import detector_of, flat_field_of, image_mask
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
 from pyklip_diffrender.scene.sequence import judge_frames
@@ -108,8 +109,8 @@ def learn_library(
     settings : GaussNewton, optional
         Of the fits; default those of `refine`. The model error is replaced.
     folder : path, optional
-        Where finished fits are kept. A run with the same frames, map and settings takes them from
-        there, and one with further stars fits those.
+        Where finished fits are kept. A run with the same frames, headers, map and settings takes
+        them from there, and one with further stars fits those.
     device : str
         PyTorch device of the optical model.
     progress : bool
@@ -173,8 +174,13 @@ class _Epoch:
     def setup(self) -> tuple[str | None, ...]:
         """Detector, mask, filter and flat field, whose frames share a pattern."""
         first = self.science[0]
-        mask = image_mask(first.header, first.name)
-        return (detector_of(first.header, first.name), mask, first.filter, flat_of(first))
+        header, name = first.header, first.name
+        return (
+            detector_of(header, name),
+            image_mask(header, name),
+            first.filter,
+            flat_field_of(header, name),
+        )
 
     @property
     def date(self) -> str:
@@ -367,15 +373,16 @@ def _shown(fit: Refinement) -> tuple[float, float]:
 
 
 def _digest(epoch: _Epoch, settings: GaussNewton, known: Systematics | None) -> str:
-    """Hash of everything that decides the result of a fit."""
-    digest = hashlib.sha256(f"{__version__} {settings!r}".encode())
-    arrays: list[NDArray[Any]] = [epoch.opd.data]
-    for each in epoch.science:
-        digest.update(f"{each.name} {each.center.tolist()} {each.first_pixel}".encode())
-        arrays += [each.data, each.error, each.valid]
-    if known is not None:
-        digest.update(f"{known.pedestal} {known.unknown} {known.first_pixel}".encode())
-        arrays += [known.pattern, known.error]
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
+    """Hash of everything that decides the result of a fit: all that frames, map and pattern say."""
+    digest = hashlib.sha256(f"{__version__} {json.dumps(encoded(settings))}".encode())
+    parts: list[Any] = [*epoch.science, replace(epoch.opd, path=None)]
+    for part in [*parts, known] if known is not None else parts:
+        for each in fields(part):
+            value = getattr(part, each.name)
+            if isinstance(value, np.ndarray):
+                content = np.ascontiguousarray(value).tobytes()
+            else:
+                text = value.tostring() if isinstance(value, Header) else repr(value)
+                content = text.encode()
+            digest.update(f"\n{each.name} {len(content)} ".encode() + content)
     return digest.hexdigest()

@@ -33,18 +33,25 @@ from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
     common_pedestal,
-    flat_of,
     measure_patterns,
 )
 from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.scene.exposure import detector_of, image_mask, star_of
+from pyklip_diffrender.scene.exposure import flat_field_of, star_of
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics, pattern_fields, pattern_hdus
+from pyklip_diffrender.scene.systematics import (
+    HALF_COVERED,
+    Systematics,
+    contradiction,
+    pattern_fields,
+    pattern_hdus,
+    shows_star,
+    unrecorded,
+)
 
 __all__ = ["PatternLibrary", "combine_libraries", "known_systematics", "package_library"]
 
-_COVERED = 0.5
-"""Smallest part of a frame's pixels that the patterns must cover to be of use."""
+_SETUP = {"filter", "mask", "detector"}
+"""What both a pattern of a library and the frames that it is for must state."""
 
 _VERSION = 2
 """Of the layout of the files, in the card PATVERS."""
@@ -94,23 +101,15 @@ class PatternLibrary:
         share one flat field: that of the observation if there are such, else the one of most
         patterns.
         """
-        header, name = observation.header, observation.name
-        star, detector = star_of(header, name), detector_of(header, name)
-        mask = image_mask(header, name)
         chosen = [
             pattern
             for pattern in self.patterns
-            if (pattern.filter, pattern.image_mask) == (observation.filter, mask)
-            and pattern.detector is not None
-            and pattern.detector == detector
-            and not (pattern.catalogue.is_same(star) or same_name(pattern.star, observation.target))
-            and not any(same_name(pattern.star, each) for each in star.names)
-            and _covered(pattern, observation) >= _COVERED
+            if contradiction(pattern, observation) is None
+            and _SETUP.isdisjoint(unrecorded(pattern, observation))
+            and not shows_star(pattern, observation)
+            and _covered(pattern, observation) >= HALF_COVERED
         ]
-        # Patterns are errors of one flat field: those of several must not be averaged.
-        flats = Counter(pattern.flat for pattern in chosen)
-        own = flat_of(observation)
-        flat = own if own in flats else max(flats, key=lambda each: flats[each], default=None)
+        flat = _flat_for(chosen, observation)
         return [pattern for pattern in chosen if pattern.flat == flat]
 
     @classmethod
@@ -240,7 +239,20 @@ def known_systematics(
     known = [pattern for pattern in known if not flats or pattern.flat in flats]
     if all(pattern.first_pixel is not None for pattern in patterns):
         patterns += [p for p in known if not any(same_name(p.star, star) for star in fitted)]
+    stated = [pattern for pattern in patterns if pattern.flat is not None]
+    flat = _flat_for(stated, observation)
+    patterns = [pattern for pattern in patterns if pattern.flat in (flat, None)]
     return combine_patterns(patterns) if len(patterns) > 1 else None
+
+
+def _flat_for(patterns: Sequence[MeasuredPattern], observation: Observation) -> str | None:
+    """The flat field of an observation if one of the patterns has it, else the most frequent one.
+
+    Patterns are errors of one flat field: those of several must not be averaged.
+    """
+    flats = Counter(pattern.flat for pattern in patterns)
+    own = flat_field_of(observation.header, observation.name)
+    return own if own in flats else max(flats, key=lambda each: flats[each], default=None)
 
 
 def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
@@ -284,9 +296,12 @@ def _hdus(pattern: MeasuredPattern, number: int) -> list[fits.ImageHDU]:
     if star.coordinates is not None:
         cards = ("RA_REF", "DEC_REF") if star.pointing else ("TARG_RA", "TARG_DEC")
         header[cards[0]], header[cards[1]] = star.coordinates
+    if star.motion is not None:
+        header["MU_RA"], header["MU_DEC"] = star.motion
+    if star.epochs and not star.pointing:
+        # The other one is the date of the frame.
+        header["MU_EPOCH"] = star.epochs[0]
     header["FRAME"], header["DATE-BEG"] = fits_text(pattern.frame), pattern.date
-    header["DETECTOR"] = pattern.detector or ""
-    header["R_FLAT"] = (pattern.flat or "", "flat field of the frame's calibration")
     if pattern.light is not None:
         hdus.append(fits.ImageHDU(pattern.light.astype(np.float32), name="STAR", ver=number))
     return hdus
@@ -305,7 +320,7 @@ def _read(path: Path) -> tuple[tuple[MeasuredPattern, ...], QTable]:
             count = sum(hdu.name == "PATTERN" for hdu in hdus)
             patterns = tuple(_pattern(hdus, k) for k in range(1, 1 + count))
             table = QTable.read(hdus["VALIDATION"]) if "VALIDATION" in hdus else QTable()
-        except (KeyError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise CorruptFileError(
                 f"{path}: not a complete library of patterns ({error}). Learn it again"
             ) from error
@@ -323,8 +338,6 @@ def _pattern(hdus: fits.HDUList, number: int) -> MeasuredPattern:
         variance=np.where(known, error, np.inf) ** 2,
         frame=header["FRAME"],
         date=header["DATE-BEG"],
-        detector=header["DETECTOR"] or None,
-        flat=header["R_FLAT"] or None,
         light=native_float64(hdus["STAR", number].data) if has_star else None,
         catalogue=star_of(header, header["FRAME"]),
         **fields,

@@ -15,10 +15,14 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import minimize_scalar
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement
-from pyklip_diffrender.scene.exposure import CatalogueStar, detector_of, image_mask, star_of
-from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.exposure import (
+    CatalogueStar,
+    detector_of,
+    flat_field_of,
+    image_mask,
+    star_of,
+)
 from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = [
@@ -27,7 +31,6 @@ __all__ = [
     "MeasuredPattern",
     "combine_patterns",
     "common_pedestal",
-    "flat_of",
     "lacks_pattern",
     "learn_systematics",
     "light_and_residual",
@@ -285,6 +288,11 @@ def lacks_pattern(fit: Refinement) -> bool:
 
 # Learn the flat-field pattern from stars other than the target.
 
+_ASPECTS = {
+    "filter": "filter", "image_mask": "mask", "detector": "detector", "flat": "flat field (R_FLAT)",
+}  # fmt: skip
+"""Properties that patterns share which are averaged, by the names of their attributes."""
+
 _SMOOTH = 1.0
 """Rings (standard deviation) over which the scatter between frames is averaged."""
 
@@ -317,6 +325,17 @@ class MeasuredPattern:
     light: Image | None = None
     # Names and place of the star.
     catalogue: CatalogueStar = field(default_factory=CatalogueStar)
+
+    @property
+    def stars(self) -> tuple[CatalogueStar, ...]:
+        """The star, by every name that is known."""
+        names = dict.fromkeys((*self.catalogue.names, self.star))
+        return (replace(self.catalogue, names=tuple(names)),)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frame, as of several."""
+        return (self.frame,) if self.frame else ()
 
     def with_pedestal(self, pedestal: float) -> MeasuredPattern:
         """Return the pattern as a fraction of the sum of the star and another pedestal.
@@ -410,14 +429,19 @@ def measure_patterns(
 def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = None) -> Systematics:
     """Average measured patterns, see `learn_systematics`, with one pedestal (`common_pedestal`).
 
-    Raises IncompatibleSetupError for patterns of several filters or none, and if the pedestals
-    differ of patterns whose stars were not kept.
+    Raises IncompatibleSetupError for patterns of several filters, masks, detectors or flat fields,
+    or of none, and if the pedestals differ of patterns whose stars were not kept.
     """
-    filters = {pattern.filter for pattern in patterns}
-    if len(filters) != 1:
-        raise IncompatibleSetupError(
-            f"systematics: got patterns of {sorted(map(str, filters))}, expected one filter"
-        )
+    setup: dict[str, str | None] = {}
+    for aspect in ("filter", "image_mask", "detector", "flat"):
+        stated = {getattr(pattern, aspect) for pattern in patterns}
+        if len(stated - {None}) > 1 or not stated:
+            raise IncompatibleSetupError(
+                f"systematics: got patterns of {sorted(map(str, stated))}, expected one "
+                f"{_ASPECTS[aspect]}"
+            )
+        # What some do not state is not known of all.
+        setup[aspect] = stated.pop() if len(stated) == 1 else None
     pedestal = common_pedestal(patterns)
     patterns = [pattern.with_pedestal(pedestal) for pattern in patterns]
     values, variances, center, first_pixel = _on_common_pixels(patterns)
@@ -443,8 +467,8 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
         first_pixel=first_pixel,
         unknown=float(np.median(width)),
         pedestal=pedestal,
-        filter=patterns[0].filter,
-        image_mask=patterns[0].image_mask,
+        **setup,
+        catalogue=tuple(dict.fromkeys(star for each in patterns for star in each.stars)),
         name=name or ", ".join(names),
         provenance={
             "stars": names,
@@ -458,12 +482,6 @@ def common_pedestal(patterns: Sequence[MeasuredPattern]) -> float:
     """The pedestal of the patterns whose star was not kept, or else the median of all."""
     fixed = [pattern.pedestal for pattern in patterns if pattern.light is None]
     return float(np.median(fixed or [pattern.pedestal for pattern in patterns]))
-
-
-def flat_of(observation: Observation) -> str | None:
-    """Name of the flat field with which frames were calibrated (R_FLAT), without its address."""
-    name = header_text(observation.header, "R_FLAT", observation.name)
-    return None if name is None else name.rpartition("/")[2]
 
 
 def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
@@ -485,7 +503,7 @@ def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
         date="" if observation.date is None else observation.date.isot,
         pedestal=pedestal,
         detector=detector_of(observation.header, observation.name),
-        flat=flat_of(observation),
+        flat=flat_field_of(observation.header, observation.name),
         light=light,
         catalogue=star_of(observation.header, observation.name),
     )

@@ -11,10 +11,11 @@ A field given in an earlier one overrides the same field in a later one:
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -25,6 +26,8 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.io.files import fits_files, stamps
+from pyklip_diffrender.options import OPTIONS
 from pyklip_diffrender.wavefront.opd import (
     RULES,
     OPDMap,
@@ -42,6 +45,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ATTRIBUTE",
+    "IMAGES",
     "DiffrenderSettings",
     "OPDLike",
     "settings_of",
@@ -54,6 +58,9 @@ OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Qua
 
 _RULES: dict[str, Rule] = {"closest": "nearest", **{rule: rule for rule in RULES}}
 """Values of `opd` that choose a map from `opd_folder`, and the rule for `choose_map`."""
+
+IMAGES = ("cleaned", "flux", "subtracted")
+"""Images that the products can carry."""
 
 ATTRIBUTE = "diffrender"
 """Attribute of a dataset that holds its own settings."""
@@ -143,6 +150,12 @@ class DiffrenderSettings:
     subtractor : Subtractor, optional
         Function that renders the star; `subtract_by_refinement` by default.
 
+    Raises
+    ------
+    IncompatibleSetupError
+        For a value that a field cannot have, and for names in `model_options` that are none of
+        `nircam_coronagraph`.
+
     Examples
     --------
     >>> import pyklip_diffrender as dr
@@ -177,6 +190,55 @@ class DiffrenderSettings:
     threads: int | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
+
+    def __post_init__(self) -> None:
+        from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+        from pyklip_diffrender.pattern import as_request
+        from pyklip_diffrender.refinement import GaussNewton, to_jansky
+
+        # Alike for `reduce`. What is read from files is kept: settings are merged for every call.
+        for name, option in OPTIONS.items():
+            value = getattr(self, name, None)
+            if value is None or name == "start":
+                continue
+            if name == "star_flux":
+                to_jansky(value)
+            elif name == "systematics":
+                object.__setattr__(self, name, as_request(value))
+            else:
+                option.checked(value)
+        if self.fit_pixels is not None:
+            replace(OPTIONS["size"], name="fit_pixels").checked(self.fit_pixels)
+        choices = (
+            ("image", self.image, IMAGES),
+            ("keep_detected", self.keep_detected, (True, False)),
+        )
+        for name, value, allowed in choices:
+            if value is not None and value not in allowed:
+                raise IncompatibleSetupError(
+                    f"{name}: got {value!r}, expected one of {', '.join(map(str, allowed))}"
+                )
+        threads = self.threads
+        if threads is not None and not (isinstance(threads, int) and threads >= 1):
+            raise IncompatibleSetupError(f"threads: got {threads!r}, expected 1 or more")
+        for name, value, kind in (
+            ("fit", self.fit, GaussNewton),
+            ("start", self.start, Mapping),
+            ("model_options", self.model_options, Mapping),
+        ):
+            if value is not None and not isinstance(value, kind):
+                raise IncompatibleSetupError(
+                    f"{name}: got a {type(value).__name__}, expected a "
+                    f"{'dict' if kind is Mapping else kind.__name__}"
+                )
+        known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
+        wrong = sorted(set(self.model_options) - known)
+        # Another subtractor may make another model.
+        if wrong and self.subtractor is None:
+            raise IncompatibleSetupError(
+                f"model_options: {', '.join(wrong)}: not known to nircam_coronagraph, which has "
+                f"{', '.join(sorted(known))}"
+            )
 
     def over(self, other: DiffrenderSettings) -> DiffrenderSettings:
         """Complete the settings by those of `other`."""
@@ -269,13 +331,12 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
     if isinstance(opd, str | os.PathLike) and opd != FLAT:
         path = Path(opd).resolve()
         # A contrast curve reads the same map for each of its 120 reductions.
-        state = path.stat() if path.is_file() else None
-        opd = _read(path, state and (state.st_mtime_ns, state.st_size))
+        opd = _read(path, tuple(stamps([path]).items()))
     return wavefront_for(opd, date)
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, version: tuple[int, int] | None) -> OPDMap:
+def _read(path: Path, version: tuple[Any, ...]) -> OPDMap:
     """Read a map once for each version of its file."""
     return as_opd_map(path)
 
@@ -289,11 +350,12 @@ def _chosen(folder: str | os.PathLike[str], date: Time | None, rule: Rule) -> OP
             "or give the file of the map as opd"
         )
     path = Path(folder).resolve()
-    version = path.stat().st_mtime_ns if path.is_dir() else 0
-    return _choose_once(path, version, date.isot, rule)
+    # The time of the folder does not say whether one of its files was written again.
+    files = fits_files(path) if path.is_dir() else ()
+    return _choose_once(path, tuple(stamps(files).items()), date.isot, rule)
 
 
 @lru_cache(maxsize=4)
-def _choose_once(folder: Path, version: int, date: str, rule: Rule) -> OPDMap:
-    """Choose a map once for each state of the folder."""
+def _choose_once(folder: Path, version: tuple[Any, ...], date: str, rule: Rule) -> OPDMap:
+    """Choose a map once for each state of the files in the folder."""
     return choose_map(folder, date, rule)

@@ -26,7 +26,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.instrument.masks import FILTERS, detector_place
-from pyklip_diffrender.io.headers import header_text
+from pyklip_diffrender.io.headers import header_text, known_text
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings, settings_of
 from pyklip_diffrender.pyklip_backend.source_frames import (
@@ -318,7 +318,8 @@ def _gather(
         except NotRecordedError as reason:
             lost = str(reason)
         if unit is None:
-            unit = u.Unit(header.get("BUNIT", ""), parse_strict="silent")
+            stated = header_text(header, "BUNIT", str(dataset.filenames[index[0]]))
+            unit = u.Unit(stated or "", parse_strict="silent")
         pixelscale = source.pixelscale if pixelscale is None else pixelscale
     if recorded is not None:
         data, valid, error, centers, factor = recorded
@@ -417,7 +418,8 @@ def _filter_name(dataset: Any, header: fits.Header, wavelength: float) -> str | 
     table = getattr(dataset, "wave_nircam", {})
     for keyword in ("PUPIL", "FILTER"):
         # As in pyKLIP: a narrow filter sits in the pupil wheel, where MASKRND is no filter.
-        if header.get(keyword) in table:
-            return str(header[keyword])
+        name = known_text(header, keyword)
+        if name in table:
+            return name
     names = [name for name, microns in table.items() if np.isclose(1e-6 * microns, wavelength)]
     return str(names[0]) if len(names) == 1 else None

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-import inspect
 import io
 import logging
 import sys
@@ -53,7 +52,6 @@ from pyklip_diffrender.pyklip_backend.forward_model import (
     planet_in_frames,
 )
 from pyklip_diffrender.pyklip_backend.output_files import (
-    IMAGES,
     ReductionRecord,
     folder_and_prefix,
     image_of,
@@ -76,7 +74,6 @@ __all__ = [
     "annuli_of",
     "check_arguments",
     "check_dataset",
-    "check_settings",
     "fill",
     "mark_filtered",
     "noise_cube",
@@ -268,34 +265,6 @@ def check_arguments(arguments: Mapping[str, Any]) -> None:
             )
 
 
-def check_settings(settings: DiffrenderSettings) -> None:
-    """Raise for settings of the default subtractor that it could not use."""
-    if settings.threads is not None and settings.threads < 1:
-        raise IncompatibleSetupError(f"threads: got {settings.threads}, expected 1 or more")
-    if settings.image not in (None, *IMAGES):
-        raise IncompatibleSetupError(
-            f"image: got {settings.image!r}, expected one of {', '.join(IMAGES)}"
-        )
-    if settings.subtractor is not None:
-        return
-    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.pattern.choice import as_request
-
-    known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
-    wrong = sorted(set(settings.model_options) - known)
-    if wrong:
-        raise IncompatibleSetupError(
-            f"model_options: {', '.join(wrong)}: not known to nircam_coronagraph, which has "
-            f"{', '.join(sorted(known))}"
-        )
-    if settings.systematics is not None:
-        as_request(settings.systematics)
-    if settings.max_chi2 is not None and not settings.max_chi2 > 0:
-        raise IncompatibleSetupError(
-            f"max_chi2: got {settings.max_chi2}, expected a positive number; inf for no limit"
-        )
-
-
 # Copies of reduced frames to which faint sources were added: self-subtraction without a fit.
 #
 # A contrast curve by injection reduces the same frames a hundred times, with other planets in each.
@@ -424,7 +393,6 @@ class DatasetReduction:
         dataset = self.dataset
         check_dataset(dataset)
         check_arguments(self.arguments)
-        check_settings(self.settings)
         for wave in np.unique(dataset.wvs):
             self._settings_at(wave)
         if getattr(dataset, _FILTERED, None) is dataset.input:

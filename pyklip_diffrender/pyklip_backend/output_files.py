@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.refinement import FrameFit, Refinement
 
 __all__ = [
-    "IMAGES",
     "ProductImages",
     "ReductionRecord",
     "folder_and_prefix",
@@ -55,8 +54,6 @@ __all__ = [
 
 
 # The images that products carry in place of the frames minus their star.
-
-IMAGES = ("cleaned", "flux", "subtracted")
 
 Image = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, NoValidPixelsError
 from pyklip_diffrender.io.files import open_fits, read_image
-from pyklip_diffrender.io.headers import fits_text, merged_header
+from pyklip_diffrender.io.headers import fits_text, header_number, merged_header
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.admission import FrameFile
 from pyklip_diffrender.scene.exposure import beginning, middle
@@ -392,8 +392,8 @@ def _read(path: str, dataset: Any) -> tuple[_File, NDArray[np.floating[Any]], ND
     if aligned:
         # Frames are back on the pixels of the detector, so that flat-field errors are, too.
         stated = [
-            header.get(f"STARCEN{axis}", header.get(f"CRPIX{k}"))
-            for k, axis in ((1, "X"), (2, "Y"))
+            header_number(header, key if key in header else other, file.name)
+            for key, other in (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
         ]
         centers += frames.center - (np.array(stated, dtype=float) - 1)
     read = _File(

@@ -4,20 +4,17 @@ from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.reduction.pipeline import Preparation, ReductionResult, prepare
 from pyklip_diffrender.reduction.products import (
     PRODUCTS,
-    UNFINISHED,
     ProductFolder,
     existing_products,
     write_products,
     write_report,
 )
 from pyklip_diffrender.reduction.reduction import Reduction, reduce
-from pyklip_diffrender.reduction.reference_star import ReferenceStar
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
     SPECTRA,
     by_star,
     combined_rows,
-    compare_reductions,
     in_words,
     search_together,
     write_comparison,
@@ -29,18 +26,15 @@ __all__ = [
     "COMPARISON",
     "PRODUCTS",
     "SPECTRA",
-    "UNFINISHED",
     "Contribution",
     "Preparation",
     "ProductFolder",
     "ReduceOptions",
     "Reduction",
     "ReductionResult",
-    "ReferenceStar",
     "Visit",
     "by_star",
     "combined_rows",
-    "compare_reductions",
     "existing_products",
     "in_words",
     "prepare",

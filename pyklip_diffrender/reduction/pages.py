@@ -88,7 +88,7 @@ def sentence(summary: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
     parts = [_compact(summary)]
     if summary["extended"]:
-        parts.insert(0, f"{summary['extended']}: fit extended light first, with --disk.")
+        parts.insert(0, f"{summary['extended']}: fit extended light first, with the option disk.")
     if summary["disk"] is not None:
         parts.insert(0, _extended(summary))
     if summary["wide_field"] is not None:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans
 from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import NDArray
@@ -34,6 +33,7 @@ from pyklip_diffrender.reduction.pages import Picture, number, plus_minus, scien
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
+from pyklip_diffrender.scene.star_place import without_gaps
 
 __all__ = ["MOST_FRAMES", "Klip", "Overview", "ReportPictures", "SkyImages"]
 
@@ -68,8 +68,7 @@ class SkyImages:
         # Frames of reference stars may be among those that were fitted.
         for (k, frame), light in zip(self._templates.frames.items(), lights, strict=True):
             subtracted = self.detection.subtracted[k]
-            filled = interpolate_replace_nans(subtracted, Gaussian2DKernel(1.0))
-            images[k] = np.nan_to_num(filled) + light
+            images[k] = without_gaps(subtracted) + light
             error = frame.observation.combined().error[0]
             errors[k] = np.where(np.isfinite(subtracted), error, np.inf)
         return combine_frames(self._templates, images, errors, self.grid @ self.to_sky)

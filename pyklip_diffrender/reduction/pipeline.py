@@ -45,13 +45,10 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternChoice,
-    as_request,
-    choose_systematics,
+    PatternLibrary,
     fit_with_pattern,
     is_known_beside,
-    with_known_pattern,
 )
-from pyklip_diffrender.reduction.reference_star import reference_star_in
 from pyklip_diffrender.reduction.visit import (
     Contribution,
     Joined,
@@ -66,6 +63,7 @@ from pyklip_diffrender.refinement import (
     quick_settings,
     refine,
     refine_again,
+    require_agreement_of_flux,
     require_calibrated,
     settings_for,
     to_jansky,
@@ -75,12 +73,11 @@ from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import OF_ANOTHER_EPOCH, Sequence
 from pyklip_diffrender.scene.simulation import model_for, within_field
-from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
 from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
 __all__ = [
     "MAX_CHI2",
-    "Checkpoint",
     "Keeper",
     "Preparation",
     "ReductionResult",
@@ -267,7 +264,7 @@ class ReductionResult:
             reason = "The residual is far above the noise, as it is where the star has a disk"
         if not reason:
             return ""
-        return f"{reason}: repeat the reduction with disk=True (--disk on the command line)."
+        return f"{reason}: repeat the reduction with the option disk."
 
     @cached_property
     def extended(self) -> str:
@@ -315,39 +312,11 @@ class ReductionResult:
         return f"{head}\n{self.detection._repr_html_()}"
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """Results so far of a reduction that was interrupted and is resumed."""
-
-    # Names of the stages: search, disk, wide, injections, completeness.
-    done: frozenset[str]
-    # Frames of reference stars that were fitted with the target's come after them.
-    fit: Refinement
-    detection: Detection
-    # What the frames of reference stars have contributed.
-    visit: Visit
-    # Of the fits of the target alone.
-    settings: GaussNewton | None
-    # The pattern of the target's own fit.
-    systematics: Systematics | None
-    # Where the pattern comes from, see `PatternChoice`, and the same with the names of its stars.
-    origin: Any
-    pattern: str
-    # Reference stars that could not be fitted, and why.
-    failed: tuple[tuple[str, str], ...]
-    disk: Disk | None
-    injections: QTable | None
-    completeness: QTable | None
-
-
 class Keeper(Protocol):
     """Receiver of the products of a reduction as they come, such as a `ProductFolder`."""
 
-    def begin(self, sequence: Sequence, opd: OPDMap, options: ReduceOptions) -> Checkpoint | None:
-        """Return what an interrupted reduction of the same frames has done; else None."""
-
-    def keep(self, stage_name: str, reduction: ReductionResult, choice: PatternChoice) -> None:
-        """Keep the products so far, after a stage."""
+    def keep(self, reduction: ReductionResult) -> object:
+        """Keep the products so far, before the next stage begins."""
 
 
 # From a sequence of frames to planets: reference stars, pattern, joint fit, search.
@@ -368,13 +337,6 @@ def prepare(
     must be inside the frames. With a model, as many pixels as its detector has are fitted; those
     beyond the edges of the frames are masked. Raises as `reduce`.
     """
-    reference = reference_star_in(opd)
-    if reference is not None:
-        for each in sequence.science:
-            reference.require_setup_of(each)
-        # What its frames say is in the prior already.
-        others = tuple(each for each in sequence.references if not reference.has(each))
-        sequence, opd = replace(sequence, references=others), reference.wavefront
     wavefront = wavefront_for(opd, sequence.date)
     is_folder = isinstance(opd, str | os.PathLike) and Path(opd).is_dir()
 
@@ -388,7 +350,7 @@ def prepare(
     elif not wavefront.data.any() and sequence.science[0].is_nircam:
         _log.warning(
             "without a wavefront map the star's flux, and contrasts with it, may be wrong by 40 %; "
-            "give the flux as star_flux (--star-flux)"
+            "give the flux with the option star_flux"
         )
     sequence = _within_field(sequence)
     if options.wide:
@@ -410,14 +372,18 @@ def prepare(
         )
     )
     cut = replace(cut, science=science, references=references)
-    if reference is not None:
-        is_open = options.systematics == "auto"
-        pattern = reference.pattern_for(cut.science[0]) if is_open else None
-        if options.settings is None:  # Whoever gives settings has chosen the prior.
-            settings = reference.settings_for(cut.science[0], settings)
-            settings = settings if pattern is None else with_known_pattern(settings)
-        if pattern is not None:
-            options = replace(options, systematics=pattern)
+    given = options.systematics
+    if isinstance(given, Systematics):
+        for each in science:
+            require_pattern_of(given, each)
+        remark = caveat(given, science[0])
+        if remark:
+            _log.warning("systematics: the pattern %r: %s", given.name, remark)
+    elif isinstance(given, PatternLibrary) and not given.matching(science[0]):
+        _log.warning(
+            "systematics: none of the %d patterns that were given is of other stars, these pixels, "
+            "detector, mask and filter", len(given.patterns)
+        )  # fmt: skip
     return Preparation(sequence, cut, model, wavefront, options, settings, map_for)
 
 
@@ -470,8 +436,7 @@ class Preparation:
     def run(self, *, progress: bool = False, products: Keeper | None = None) -> ReductionResult:
         """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
 
-        `products` gets the products as they come, and may have what an interrupted reduction has
-        done.
+        `products` gets the products as they come.
         """
         with numbered_stages():
             return _Run(self, progress, products).result()
@@ -487,37 +452,25 @@ class _Run:
 
     def result(self) -> ReductionResult:
         options, whole = self.preparation.options, self.preparation.whole.science
-        saved: Checkpoint | None = None
-        detection: Detection | None = None
+        self._require_possible_flux()
+        choice, fit = fit_with_pattern(
+            self.preparation.sequence.science,
+            self._teaching,
+            self.preparation.model,
+            self.preparation.wavefront,
+            self._first_fit,
+            systematics=options.systematics,
+            settings=self.preparation.settings,
+            memory=options.memory,
+            progress=self.progress,
+            map_for=self.preparation.map_for,
+        )
+        fit, visit, detection = self._with_references(fit, choice)
+        self._say_what_is_unused(visit)
         disk: Disk | None = None
         wide: WideField | None = None
         injections: QTable | None = None
         fractions: QTable | None = None
-        done: frozenset[str] = frozenset()
-        if self.products is not None:
-            saved = self.products.begin(
-                self.preparation.sequence, self.preparation.wavefront, options
-            )
-        if saved is None:
-            choice, fit = fit_with_pattern(
-                self.preparation.sequence.science,
-                self._teaching,
-                self.preparation.model,
-                self.preparation.wavefront,
-                self._first_fit,
-                systematics=options.systematics,
-                settings=self.preparation.settings,
-                memory=options.memory,
-                progress=self.progress,
-                map_for=self.preparation.map_for,
-            )
-            label = choice.label
-            fit, visit, detection = self._with_references(fit, choice)
-            self._say_what_is_unused(visit)
-        else:
-            choice, label, done = self._choice(saved), saved.pattern, saved.done
-            fit, visit, detection = saved.fit, saved.visit, saved.detection
-            disk, injections, fractions = saved.disk, saved.injections, saved.completeness
         sequence = replace(self.preparation.sequence, science=choice.science)
 
         def reduction() -> ReductionResult:
@@ -529,7 +482,7 @@ class _Run:
                 choice.references,
                 choice.systematics,
                 choice.failed,
-                label,
+                choice.label,
                 visit,
                 wide,
                 disk,
@@ -538,45 +491,42 @@ class _Run:
                 options.accuracy,
             )
 
-        def keep(name: str) -> None:
-            if self.products is not None and self._has_more_after(name):
-                with stage(f"products after the stage {name}"):
-                    self.products.keep(name, reduction(), choice)
+        def keep() -> None:
+            if self.products is not None:
+                with stage("products so far"):
+                    self.products.keep(reduction())
 
-        if saved is None and (self.products is not None or not options.disk):
+        if self.products is not None or not options.disk:
             with stage("search"):
                 # Where limits with and without the reference stars were compared, it was searched.
                 detection = detection or self._search(fit)
-            keep("search")
-        if options.disk and "disk" not in done:
+        if options.disk:
+            keep()
             with stage("extended light, and wavefront without it"):
                 disk = fit_disk(fit, progress=self.progress)
                 fit = disk.fit
             with stage("search without extended light"):
                 detection = self._search(fit, disk)
-            keep("disk")
         assert detection is not None
         if options.wide:
+            keep()
             with stage("whole frames"):
                 wide = wide_field(detection, whole)
-            cleaned = None if "wide" in done else wide.subtracted(whole, sequence.science)
+            cleaned = wide.subtracted(whole, sequence.science)
             if cleaned is not None:
                 with stage("star and search without the light of sources beyond the fitted pixels"):
                     fit, visit, again = self._with_references(self._fit(cleaned, choice), choice)
                     detection = again or self._search(fit)
                     wide = wide_field(detection, whole)
-            if "wide" not in done:
-                keep("wide")
         has_limits = bool(len(detection.contrast_curve))
-        if options.injections and has_limits and not self._has(injections, options.injections):
+        if options.injections and has_limits:
+            keep()
             with stage(f"{options.injections} injected planets"):
                 injections = self._inject(detection, choice, disk)
-            if injections is not None:
-                keep("injections")
-        if options.completeness and has_limits and fractions is None:
+        if options.completeness and has_limits:
+            keep()
             with stage("completeness"):
                 fractions = completeness(detection, progress=self.progress)
-            keep("completeness")
         self._require_plausible(detection.fits[0])  # It may have been fitted with companions.
         return reduction()
 
@@ -587,25 +537,9 @@ class _Run:
         whole, cut = prepared.whole.science, prepared.sequence.science
         if not any(map(has_bright_pixels_beyond, whole, cut)):
             return ()
-        aligned = replace(
-            prepared.settings or settings_for(cut[0]),
-            wavefront=False,
-            companions=(),
-            max_companions=0,
-            companions_if_stalled=False,
-            max_iterations=_ALIGNING,
-        )
 
         def sources(science: tuple[Observation, ...]) -> tuple[list[Planet], list[Any]]:
-            fit = refine(
-                prepared.model,
-                science,
-                prepared.wavefront,
-                settings=aligned,
-                start=prepared.options.start,
-                progress=self.progress,
-            )
-            return sources_beyond(fit.frames, whole, cut)
+            return sources_beyond(self._aligned(science).frames, whole, cut)
 
         with stage("bright sources beyond the fitted pixels"):
             _, lights = sources(cut)
@@ -624,42 +558,33 @@ class _Run:
             )  # fmt: skip
         return tuple(planets)
 
-    @staticmethod
-    def _has(injections: QTable | None, count: int) -> bool:
-        return injections is not None and len(injections) == count
-
-    def _has_more_after(self, name: str) -> bool:
-        """Whether the options ask for stages after one."""
-        options = self.preparation.options
-        stages = {
-            "search": True,
-            "disk": options.disk,
-            "wide": options.wide,
-            "injections": bool(options.injections),
-            "completeness": options.completeness,
-        }
-        later = list(stages)[list(stages).index(name) + 1 :]
-        return any(stages[each] for each in later)
-
-    def _choice(self, saved: Checkpoint) -> PatternChoice:
-        """The choice of the pattern of an interrupted reduction, without fits of other stars."""
-        options = self.preparation.options
-        # The pattern of reference stars or of the caller was stored. That of the library is looked
-        # up again, which moves the frames onto its pixels if need be.
-        known = as_request(options.systematics)
-        if saved.origin != "library":
-            known = saved.systematics or "off"
-        choice = choose_systematics(
-            self.preparation.sequence.science,
-            (),
-            self.preparation.model,
-            self.preparation.wavefront,
-            systematics=known,
-            settings=self.preparation.settings,
-            memory=None if options.memory is None else to_bytes(options.memory, "memory"),
+    def _aligned(self, science: tuple[Observation, ...]) -> Refinement:
+        """Fit place, flux and background of frames with the wavefront of the map."""
+        prepared = self.preparation
+        settings = replace(
+            prepared.settings or settings_for(science[0]),
+            wavefront=False,
+            companions=(),
+            max_companions=0,
+            companions_if_stalled=False,
+            max_iterations=_ALIGNING,
+        )
+        return refine(
+            prepared.model,
+            science,
+            prepared.wavefront,
+            settings=settings,
+            start=prepared.options.start,
             progress=self.progress,
         )
-        return replace(choice, settings=saved.settings, failed=saved.failed, origin=saved.origin)
+
+    def _require_possible_flux(self) -> None:
+        """Find a flux of the star in a mistaken unit before the wavefront is fitted."""
+        stated = self.preparation.options.star_flux
+        if stated is not None:
+            aligned = self._aligned(self.preparation.sequence.science)
+            if aligned.status.usable:
+                require_agreement_of_flux(aligned, to_jansky(stated))
 
     def _first_fit(self, choice: PatternChoice, again: bool) -> Refinement:
         without = ", without the library's flat-field pattern" if again else ""
@@ -768,7 +693,7 @@ class _Run:
         if failed is not None:
             return failed
         if not any(each is reference for each in self._teaching):
-            return f"references is {self.preparation.options.references!r} (--references)"
+            return f"the option references is {self.preparation.options.references!r}"
         is_near = any(each is reference for each in self.preparation.sequence.same_epoch)
         where = "" if is_near else f"{OF_ANOTHER_EPOCH}, and "
         why = {

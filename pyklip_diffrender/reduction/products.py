@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import logging
 import os
 import re
 from collections import abc
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from astropy.table import QTable
-
 from pyklip_diffrender import drawing
-from pyklip_diffrender._version import __version__
-from pyklip_diffrender.detection import Detection, Disk
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
-from pyklip_diffrender.io.files import read_text, replacing, require_new, write_table
-from pyklip_diffrender.pattern import PatternChoice
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import OutputFolder, replacing, write_table
 from pyklip_diffrender.reduction.pages import (
     FIGURE_FORMATS,
     count,
@@ -33,19 +25,11 @@ from pyklip_diffrender.reduction.pages import (
     write_figures,
 )
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
-from pyklip_diffrender.reduction.pipeline import Checkpoint, ReductionResult
-from pyklip_diffrender.reduction.reference_star import ReferenceStar
+from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import summarise
-from pyklip_diffrender.reduction.visit import Contribution, Visit
-from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.fit_file import decoded, encoded
-from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.scene.systematics import Systematics
-from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = [
     "PRODUCTS",
-    "UNFINISHED",
     "ProductFolder",
     "existing_products",
     "page",
@@ -167,7 +151,7 @@ def _pattern(used: Mapping[str, Any] | None) -> str:
     text = " and ".join(filter(None, parts)) or used["name"]
     if used["size"] is not None:
         text += f"; strength in these frames {plus_minus(used['size'], used['size_error'])}"
-    return text
+    return "; ".join(filter(None, (text, used["caveat"])))
 
 
 def _age(days: float | None) -> str:
@@ -215,15 +199,6 @@ def _setting(value: Any) -> str:
 
 # The files that a reduction writes.
 
-_log = logging.getLogger(__name__)
-
-
-UNFINISHED = "unfinished.json"
-"""File that is in the folder of products until all stages of a reduction are done."""
-
-_LATER = ("injections", "completeness", "device", "memory")
-"""Options that may differ when a reduction is resumed: the fit and the search are the same."""
-
 PRODUCTS = {
     "report.html": "this page",
     "summary.json": "the content of this page, for programs",
@@ -241,8 +216,6 @@ PRODUCTS = {
     "completeness.ecsv": "fraction of planets that the search finds, by contrast and separation",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the flat-field pattern, for other reductions",
-    "reference.fits": "wavefront and pattern, for fits of other stars of the visit",
-    UNFINISHED: "stages that are done, for a reduction that is resumed",
 }
 """Every file that a reduction may write, with its content."""
 
@@ -277,11 +250,11 @@ def write_products(
     derivatives: bool = False,
     figures: Literal["pdf", "png", "svg"] | None = None,
 ) -> list[Path]:
-    """Write the products of a reduction, and return their paths; see `Reduction.write`.
+    """Write the products of a reduction to a folder without any, and return their paths.
 
-    The folder is made if it does not exist. Afterwards it has no products of an earlier reduction.
-    `derivatives` says whether ``fit.fits`` has those of the images. Raises IncompatibleSetupError
-    for a format that is not one of `FIGURE_FORMATS`.
+    The folder is made if it does not exist. `derivatives` says whether ``fit.fits`` has the
+    derivatives of the images. Raises IncompatibleSetupError for a format that is not one of
+    `FIGURE_FORMATS`.
     """
     if figures is not None and figures not in FIGURE_FORMATS:
         raise IncompatibleSetupError(
@@ -298,9 +271,6 @@ def write_products(
         written.append(reduction.disk.write(folder, overwrite=True))
     if reduction.systematics is not None:
         written.append(reduction.systematics.write(folder / "systematics.fits", overwrite=True))
-    if reduction.fit.status.usable:
-        reference = ReferenceStar.of(reduction.fit)
-        written.append(reference.write(folder / "reference.fits", overwrite=True))
     tables = {"injections": reduction.injections, "completeness": reduction.completeness}
     for name, table in tables.items():
         if table is not None:
@@ -314,17 +284,14 @@ def write_products(
     if figures is not None:
         written += write_figures(pictures, folder / _FIGURES, figures)
     written += _write_page(summary, pictures, folder, written)
-    for path in set(existing_products(folder)) - set(written):
-        path.unlink()
     return written
 
 
-class ProductFolder:
+class ProductFolder(OutputFolder):
     """A folder into which a reduction writes its products as its stages end.
 
-    Until it has finished, the folder also has the file unfinished.json, and ``fit.fits`` the
-    derivatives, from which the reduction can go on; `derivatives` and `figures` are for the end.
-    Raises ExistingFileError if there are products that neither `overwrite` nor `resume` allows.
+    `derivatives` and `figures` are as for `Reduction.write`. Raises ExistingFileError if there are
+    products in the folder, and `overwrite` is False.
     """
 
     def __init__(
@@ -334,114 +301,17 @@ class ProductFolder:
         derivatives: bool = False,
         figures: Literal["pdf", "png", "svg"] | None = None,
         overwrite: bool = False,
-        resume: bool = False,
     ) -> None:
-        self.folder, self._derivatives, self._figures = Path(folder), derivatives, figures
-        self._resumes = resume and (self.folder / UNFINISHED).exists()
-        if not self._resumes:
-            require_new(existing_products(self.folder), overwrite)
-        self._facts: dict[str, Any] = {}
+        super().__init__(folder, existing_products, overwrite=overwrite)
+        self._derivatives, self._figures = derivatives, figures
 
-    def begin(self, sequence: Sequence, opd: OPDMap, options: Any) -> Checkpoint | None:
-        """Return what an interrupted reduction of the same frames has done; else None.
-
-        Raises IncompatibleSetupError if that was of other frames or with other options, and
-        CorruptFileError if one of its files is damaged.
-        """
-        fingerprint = _fingerprint(sequence, opd, options)
-        self._facts = {"version": __version__, "fingerprint": fingerprint, "done": []}
-        if not self._resumes:
-            return None
-        path = self.folder / UNFINISHED
-        try:
-            facts = json.loads(read_text(path))
-            same = (facts["version"], facts["fingerprint"]) == (__version__, fingerprint)
-            done, choice = frozenset(facts["done"]), facts["choice"]
-            failed = tuple((str(name), str(why)) for name, why in choice["failed"])
-            settings, origin = decoded(choice["settings"]), choice["origin"]
-            pattern, visit = str(choice["pattern"]), _visit_of(facts["visit"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise CorruptFileError(
-                f"{path} is damaged ({error!r}). Start the reduction anew, with overwrite=True "
-                "(--overwrite)"
-            ) from error
-        if not same:
-            raise IncompatibleSetupError(
-                f"resume: {self.folder} has an interrupted reduction of other frames, with other "
-                "options or by another version of the package. Repeat its options, or start anew "
-                "with overwrite=True (--overwrite)"
+    def keep(self, reduction: ReductionResult) -> list[Path]:
+        """Write the products of a reduction, as far as it has come, and return their paths."""
+        return self.replace(
+            lambda folder: write_products(
+                reduction, folder, derivatives=self._derivatives, figures=self._figures
             )
-        self._facts["done"] = sorted(done)
-        fit = Refinement.read(self.folder / "fit.fits")
-        known = self.folder / "systematics.fits"
-        tables = {
-            name: QTable.read(self.folder / f"{name}.ecsv")
-            for name in ("injections", "completeness")
-            if name in done and (self.folder / f"{name}.ecsv").exists()
-        }
-        _log.info("resumed after: %s", ", ".join(sorted(done)))
-        return Checkpoint(
-            done,
-            fit,
-            Detection.read(self.folder, fit=fit),
-            visit,
-            settings,
-            Systematics.read(known) if known.exists() else None,
-            origin,
-            pattern,
-            failed,
-            Disk.read(self.folder, fit) if "disk" in done else None,
-            tables.get("injections"),
-            tables.get("completeness"),
         )
-
-    def keep(self, stage_name: str, reduction: ReductionResult, choice: PatternChoice) -> None:
-        """Write the products so far, after a stage."""
-        self._facts["done"] = sorted({*self._facts["done"], stage_name})
-        self._facts["choice"] = {
-            "settings": encoded(choice.settings),
-            "origin": choice.origin,
-            "pattern": reduction.pattern,
-            "failed": choice.failed,
-        }
-        self._facts["visit"] = encoded(asdict(reduction.visit))
-        table = getattr(reduction, stage_name, None)
-        path = self.folder / UNFINISHED
-        if isinstance(table, QTable):
-            # The rest is as it was, and the report follows at the end.
-            write_table(table, self.folder / f"{stage_name}.ecsv")
-        else:
-            # Until all files are of the same stage, there is nothing to resume.
-            path.unlink(missing_ok=True)
-            write_products(reduction, self.folder, derivatives=True)
-        with replacing(path) as temporary:
-            temporary.write_text(json.dumps(self._facts, indent=2) + "\n", encoding="utf-8")
-
-    def finish(self, reduction: ReductionResult) -> list[Path]:
-        """Write all products; the reduction has finished."""
-        return write_products(
-            reduction, self.folder, derivatives=self._derivatives, figures=self._figures
-        )
-
-
-def _visit_of(facts: Any) -> Visit:
-    """The visit that was written to the file of what is done."""
-    known = decoded(facts)
-    return Visit(tuple(Contribution(**each) for each in known["contributions"]), known["gain"])
-
-
-def _fingerprint(sequence: Sequence, opd: OPDMap, options: Any) -> str:
-    """Hash of frames, wavefront map and options that decide the fit and the search."""
-    total = hashlib.sha256()
-    for frame in (*sequence.science, *sequence.references):
-        for array in (frame.data, frame.error, frame.valid):
-            total.update(np.ascontiguousarray(array).tobytes())
-    total.update(np.ascontiguousarray(opd.data).tobytes())
-    named = {each.name: getattr(options, each.name) for each in fields(options)}
-    named["settings"] = encoded(named["settings"])
-    chosen = {name: value for name, value in named.items() if name not in _LATER}
-    total.update(json.dumps(chosen, sort_keys=True, default=repr).encode())
-    return total.hexdigest()
 
 
 def write_report(

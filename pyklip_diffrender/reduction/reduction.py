@@ -8,14 +8,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, Unpack
 
-from pyklip_diffrender.io.files import require_new
 from pyklip_diffrender.options import ReduceKeywords, ReduceOptions
 from pyklip_diffrender.reduction.pipeline import ReductionResult, prepare
-from pyklip_diffrender.reduction.products import (
-    ProductFolder,
-    existing_products,
-    write_products,
-)
+from pyklip_diffrender.reduction.products import ProductFolder
 from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = ["Reduction", "reduce"]
@@ -79,8 +74,7 @@ class Reduction(ReductionResult):
         folder : path
             Made if it does not exist.
         overwrite : bool
-            Replace the products of an earlier reduction, and remove those that this one does not
-            have.
+            Replace the products of an earlier reduction, and remove what this one does not have.
         derivatives : bool
             Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
             space: they are needed to search the fit again (`detect`), and to measure at other
@@ -101,9 +95,10 @@ class Reduction(ReductionResult):
         IncompatibleSetupError
             For another format of figures.
         """
-        folder = Path(folder)
-        require_new(existing_products(folder), overwrite)
-        return write_products(self, folder, derivatives=derivatives, figures=figures)
+        products = ProductFolder(
+            folder, derivatives=derivatives, figures=figures, overwrite=overwrite
+        )
+        return products.keep(self)
 
 
 def reduce(
@@ -116,7 +111,6 @@ def reduce(
     options: ReduceOptions | None = None,
     output: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
-    resume: bool = False,
     **keywords: Unpack[ReduceKeywords],
 ) -> Reduction:
     """Search a sequence of real frames for planets.
@@ -143,12 +137,9 @@ def reduce(
         Folder for the products, as those of `Reduction.write`. They are written as they come: those
         of the fit and the search before wide, disk, injections and completeness begin.
     overwrite : bool
-        Replace the products of an earlier reduction in `output`.
-    resume : bool
-        Go on with a reduction that was interrupted after its products in `output` were written
-        for the first time. Frames, map and options must be the same, but for injections and
-        completeness. What the frames of reference stars contributed (``Reduction.visit``) is kept;
-        fits of reference stars by themselves, for a pattern (``Reduction.references``), are not.
+        Replace the products of an earlier reduction in `output`. Products that somebody else writes
+        there while this reduction runs are kept in any case: those of this one then go to a new
+        folder in `output`.
     **keywords
         Options by name, such as ``size=120``: the fields of `ReduceOptions`.
 
@@ -159,15 +150,20 @@ def reduce(
     Raises
     ------
     IncompatibleSetupError
-        For options that `ReduceOptions` refuses, and for `star_flux` with frames that are not
-        calibrated.
+        For options that `ReduceOptions` refuses, for `star_flux` with frames that are not
+        calibrated, and if `output` is a file.
     TypeError
         For a keyword that is no option, or keywords together with `options`.
     ExistingFileError
-        If there are products in `output`, and neither `overwrite` nor `resume` allows it; it is
-        also an `OSError`.
+        If there are products in `output`, and `overwrite` is False; it is also an `OSError`.
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If products that were written to `output` meanwhile are kept, with the folder of the new
+        ones.
 
     Examples
     --------
@@ -186,12 +182,12 @@ def reduce(
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     if output is None:
-        if overwrite or resume:
-            raise TypeError("reduce() got overwrite or resume without output, a folder")
+        if overwrite:
+            raise TypeError("reduce() got overwrite without output, a folder")
         return _writable(prepare(sequence, opd, options).run(progress=progress))
-    products = ProductFolder(output, overwrite=overwrite, resume=resume)
+    products = ProductFolder(output, overwrite=overwrite)
     result = prepare(sequence, opd, options).run(progress=progress, products=products)
-    products.finish(result)
+    products.keep(result)
     return _writable(result)
 
 

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
+from pyklip_diffrender.io.headers import known_number, known_text
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction.pages import advice, sentence
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import caveat
 
 __all__ = ["summarise", "wavefronts"]
 
@@ -48,10 +50,10 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
     dates = [each.date for each in sequence.science if each.date is not None]
     summary = {
         "target": sequence.target,
-        "instrument": first.header.get("INSTRUME"),
+        "instrument": known_text(first.header, "INSTRUME"),
         "filter": sequence.filter,
-        "image_mask": first.header.get("CORONMSK"),
-        "program": first.header.get("PROGRAM"),
+        "image_mask": known_text(first.header, "CORONMSK"),
+        "program": known_text(first.header, "PROGRAM"),
         "exposure_s": _exposure(sequence.science),
         "first_date": min(dates).isot if dates else None,
         "last_date": max(dates).isot if dates else None,
@@ -159,6 +161,7 @@ def _systematics(reduction: ReductionResult) -> dict[str, Any] | None:
         "other_stars": [star for star in provenance["stars"] if star not in fitted],
         "size": size,
         "size_error": error,
+        "caveat": caveat(used, reduction.sequence.science[0]),
     }
 
 
@@ -290,7 +293,7 @@ def _frame(observation: Observation, use: str) -> dict[str, Any]:
         "date": None if observation.date is None else observation.date.isot,
         "position_angle_deg": observation.position_angle if oriented else None,
         "integrations": observation.count,
-        "exposure_s": observation.header.get("EFFEXPTM"),
+        "exposure_s": known_number(observation.header, "EFFEXPTM"),
         "pixels_used": observation.valid.mean(),
         "file": observation.name,
     }
@@ -298,8 +301,9 @@ def _frame(observation: Observation, use: str) -> dict[str, Any]:
 
 def _exposure(frames: Sequence[Observation]) -> float | None:
     """Exposure time of all frames, s; None where one does not say it."""
-    times = [each.header.get("EFFEXPTM") for each in frames]
-    return None if None in times else sum(times)
+    times = [known_number(each.header, "EFFEXPTM") for each in frames]
+    known = [each for each in times if each is not None]
+    return sum(known) if len(known) == len(times) else None
 
 
 def _bad_pixels(observation: Observation, fitted: FrameFit) -> list[list[float]]:

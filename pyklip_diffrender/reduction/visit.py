@@ -57,7 +57,6 @@ __all__ = [
     "Contribution",
     "Visit",
     "rough_settings",
-    "slew_drift",
     "with_references",
     "worth_joining",
 ]
@@ -66,7 +65,6 @@ _log = logging.getLogger(__name__)
 
 _SLEWS = WavefrontPrior(scales={"segment": 0.75, "texture": 0.5}, knee=1.0, slope=1.0)
 _DITHERS = WavefrontPrior(scales={"segment": 0.4, "texture": 0.25}, knee=1.0, slope=1.0)
-_SLEW_RMS = 2.7
 _CYCLES = 8.0
 """Drift of the wavefront, nm, between exposures with a slew between them and between the dithers of
 one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show it, from a fourth
@@ -204,12 +202,6 @@ class Joined(NamedTuple):
     detection: Detection | None = None  # its search, if there was one
 
 
-def slew_drift(further: float = 0.0) -> WavefrontPrior:
-    """Prior of the drift from one star to the next, `further` nm rms beyond that within hours."""
-    growth = 1 + further / _SLEW_RMS
-    return replace(_SLEWS, scales={name: growth * scale for name, scale in _SLEWS.scales.items()})
-
-
 def rough_settings(settings: GaussNewton) -> GaussNewton:
     """Settings of a fit of the target from which the fit of all frames goes on."""
     return replace(settings, tolerance=max(settings.tolerance, _ROUGH), adapt_prior=False)
@@ -345,7 +337,7 @@ def _that_fit_into(
     nearest = sorted(references, key=days)
     chosen = nearest[: max(0, int(spare))]
     for each in nearest[len(chosen) :]:
-        left_out[each.name] = f"it does not fit into {memory / 1e9:.3g} GB of memory (--memory)"
+        left_out[each.name] = f"it does not fit into {memory / 1e9:.3g} GB of the option memory"
         _log.warning("%s is left out: %s", each.name, left_out[each.name])
     return [each for each in references if any(each is one for one in chosen)]
 

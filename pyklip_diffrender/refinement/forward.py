@@ -17,6 +17,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
 from pyklip_diffrender.instrument.masks import mask_of_header
+from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.io.units import ARCSEC, to_number
 from pyklip_diffrender.linear.model import Noise
 from pyklip_diffrender.linear.response import (
@@ -30,7 +31,7 @@ from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
-from pyklip_diffrender.scene.exposure import module_of
+from pyklip_diffrender.scene.exposure import flat_field_of, module_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap, resample
@@ -189,12 +190,12 @@ def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
     Settings that are unknown on either side, such as those of a system that is not an instrument,
     are not compared. Raises `IncompatibleSetupError`.
     """
-    setup, header = model.setup, observation.header
+    setup, header, name = model.setup, observation.header, observation.name
     setups = (
         ("filter", setup.get("filter"), observation.filter),
-        ("image mask", setup.get("image_mask"), header.get("CORONMSK")),
-        ("pupil mask", setup.get("pupil_mask"), header.get("PUPIL")),
-        ("module", setup.get("module"), module_of(header, observation.name)),
+        ("image mask", setup.get("image_mask"), header_text(header, "CORONMSK", name)),
+        ("pupil mask", setup.get("pupil_mask"), header_text(header, "PUPIL", name)),
+        ("module", setup.get("module"), module_of(header, name)),
     )
     for aspect, expected, actual in setups:
         if not isinstance(expected, str) or not isinstance(actual, str):
@@ -642,8 +643,8 @@ class Objective:
 
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
-        # Which frames show the same pixels of the detector, so that the error of the systematics is
-        # one unknown in all of them. It is noise of every other frame.
+        # Which frames show the same pixels of the detector through the same flat field, so that the
+        # error of the systematics is one unknown in all of them. It is noise of every other frame.
         self.shares_pattern = _sharing([forward.problem for forward in self.forwards])
         self.robust = robust
 
@@ -744,20 +745,21 @@ class Objective:
 
 
 def _sharing(problems: Sequence[Problem]) -> tuple[bool, ...]:
-    """Which frames show the same pixels of the detector with an uncertain pattern.
+    """Which frames show the same pixels with one flat field, whose pattern is uncertain.
 
     Of several such sets the largest shares it, or the first one of two equal ones.
     """
     places = [
-        (each.observation.first_pixel, each.observation.shape, id(each.systematics))
+        (seen.first_pixel, seen.shape, flat_field_of(seen.header, seen.name), id(each.systematics))
         for each in problems
+        for seen in (each.observation,)
     ]
     known = [
         place
         for place, problem in zip(places, problems, strict=True)
         if place[0] is not None and bool((problem.gain_error > 0).any())
     ]
-    # Frames that show the same pixels have the same first pixel, shape and systematics.
+    # Such frames have the same first pixel, shape, flat field and systematics.
     most = max(known, key=known.count, default=None)
     if most is None or known.count(most) < 2:
         return (False,) * len(problems)

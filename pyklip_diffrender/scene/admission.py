@@ -18,8 +18,9 @@ from astropy.io import fits
 from astropy.time import Time
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.io.files import fits_files, open_fits, unpacked_name
+from pyklip_diffrender.io.files import open_fits, product_in, unpacked_name
 from pyklip_diffrender.io.headers import merged_header, same_name, unknown_name
+from pyklip_diffrender.scene.associations import ListedFile, listed_files
 from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
@@ -48,7 +49,7 @@ __all__ = [
 _SENSED = "RESULT_PHASE"
 """Extension of wavefront-sensing files of MAST."""
 
-_MAP = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd (--opd)"
+_MAP = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd"
 
 _USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
 """Levels of frames that are still those of the detector, the best first."""
@@ -149,46 +150,42 @@ def exposures_in(
     references: Iterable[str | os.PathLike[str]] = (),
     filter: str | None = None,
 ) -> list[FrameFile]:
-    """Find FITS files, or those in folders, and read their headers; NoValidPixelsError for none.
+    """Find the files that are meant, and read their headers; raises as `listed_files`.
 
     Files that are all marked as those of reference stars are of the target if there are
     `references`. With a `filter`, the frames of its calints files are read at once, so that none of
-    these is opened twice; files of other levels may be copies, which are not read. Raises
-    `IncompatibleSetupError` for what is no path.
+    these is opened twice; files of other levels may be copies, which are not read.
     """
-    entries = list(files) if isinstance(files, Iterable) and not isinstance(files, str) else [files]
-    paths: list[Path] = []
-    for each in entries:
-        if not isinstance(each, str | os.PathLike):
-            raise IncompatibleSetupError(
-                f"files: got a {type(each).__name__}, expected paths of FITS files or folders. "
-                "Frames in memory go into a Sequence: Sequence(target, (frame, ...))"
-            )
-        path = Path(each)
-        if path.is_dir():
-            inside = fits_files(path)
-            if not inside:
-                raise NoValidPixelsError(f"{path}: the folder has no FITS files")
-            paths += inside
-        else:
-            paths.append(path)
-    if not paths:
-        raise NoValidPixelsError("files: got none, expected at least one")
 
     def is_wanted(exposure: Exposure) -> bool:
         usable = same_name(exposure.filter, filter) and not _why_unusable(exposure)
         return usable and _rank(exposure) == 0
 
     frames = False if filter is None else is_wanted
-    listed = [FrameFile.opened(path, frames=frames) for path in paths]
+
+    def opened(listed: ListedFile) -> FrameFile:
+        path = listed.path
+        if listed.reason:
+            return FrameFile(path, Exposure(path.name), reason=listed.reason, is_product=True)
+        file = FrameFile.opened(path, frames=frames)
+        if listed.role == "science":
+            file.exposure = replace(file.exposure, reference=False)
+        return file
+
+    found = listed_files(files)
+    others = list(references)
+    marked = [
+        *(each for each in found if each.role == "psf"),
+        *(listed_files(others) if others else ()),
+    ]
     return with_references(
-        listed, [FrameFile.opened(Path(path), frames=frames) for path in references]
+        [opened(each) for each in found if each.role != "psf"], list(map(opened, marked))
     )
 
 
 def with_references(listed: list[FrameFile], marked: list[FrameFile]) -> list[FrameFile]:
     """Add files of reference stars, whatever their headers say, see `exposures_in`."""
-    if marked and all(file.exposure.reference for file in listed):
+    if marked and all(file.exposure.reference for file in listed if not file.is_product):
         for file in listed:
             file.exposure = replace(file.exposure, reference=False)
     for file in marked:
@@ -203,11 +200,11 @@ def _why_a_product(hdus: fits.HDUList) -> str:
     Only the contents count: products keep cards of the frames, and may have any name.
     """
     first = hdus[0].header
-    what = ""
-    if "SCI" not in hdus and any(_is_map(hdu) for hdu in hdus):
+    product, what = product_in(hdus), ""
+    if product:
+        what = f"{product}, a product of pyklip_diffrender"
+    elif "SCI" not in hdus and any(_is_map(hdu) for hdu in hdus):
         return _MAP
-    if any(key in first for key in ("DRVERS", "PATVERS")):
-        what = "a product of pyklip_diffrender"
     elif any(key in hdu.header for hdu in hdus[:2] for key in ("PYKLIPV", "PSFSUB")):
         what = "an image from which pyKLIP has subtracted the star"
     elif "SCI" not in hdus:

@@ -6,18 +6,20 @@ No card has a default here: a value that is not stated is None, and whoever need
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy import units as u
-from astropy.coordinates import angular_separation
+from astropy.coordinates import angular_separation, offset_by
 from astropy.io import fits
 from astropy.time import Time
+from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import CorruptFileError
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.io.headers import (
     card_error,
     day_and_time,
@@ -33,7 +35,9 @@ __all__ = [
     "Exposure",
     "bar_place",
     "beginning",
+    "common_motion",
     "detector_of",
+    "flat_field_of",
     "identity_of",
     "image_mask",
     "instrument_of",
@@ -101,6 +105,12 @@ def detector_of(header: fits.Header, name: str) -> str | None:
     return match[9].upper() if match else None
 
 
+def flat_field_of(header: fits.Header, name: str) -> str | None:
+    """Name of the flat field of the calibration (R_FLAT), without its address; None if unstated."""
+    stated = header_text(header, "R_FLAT", name)
+    return None if stated is None else stated.rpartition("/")[2]
+
+
 def identity_of(header: fits.Header, name: str) -> str | None:
     """Name of the exposure, as the archive makes it; None if the header does not say."""
     detector = detector_of(header, name)
@@ -132,12 +142,21 @@ _COORDINATES: tuple[tuple[str, str], ...] = (("TARG_RA", "TARG_DEC"), ("RA_REF",
 """Cards of the star's coordinates, and of where the telescope pointed."""
 
 _SAME_PLACE = 5.0
-"""arcsec between the coordinates of one star in two headers. They may be those of a catalogue's
-epoch in one, and of the exposure in the other."""
+"""arcsec between the coordinates of one star in two headers, at one epoch."""
 
 _SAME_POINTING = 60.0
 """arcsec between the coordinates of one star if its names agree, or if one of the two is where the
 telescope pointed."""
+
+_FASTEST = 11.0
+"""arcsec per year that no star exceeds: Barnard's star moves by 10.4."""
+
+_SAME_MOTION = 0.01
+"""arcsec per year by which the proper motions of one star in two headers may differ. Catalogues
+agree to a few milliarcseconds, and a background source is measured to about ten."""
+
+_OLDEST = 2000.0
+"""Julian year of the oldest coordinates that proposals have: those of the equinox J2000."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +166,9 @@ class CatalogueStar:
     names: tuple[str, ...] = ()  # the proposer's (TARGPROP), the catalogue's (TARGNAME)
     coordinates: tuple[float, float] | None = None  # RA and Dec, degrees
     pointing: bool = False  # the coordinates are where the telescope pointed
+    motion: tuple[float, float] | None = None  # see `proper_motion`; None also if it cannot be true
+    # Julian years of which the coordinates may be: the catalogue's and the exposure's.
+    epochs: tuple[float, ...] = ()
 
     @property
     def is_known(self) -> bool:
@@ -158,11 +180,26 @@ class CatalogueStar:
         return any(same_name(name, each) for each in self.names)
 
     def separation(self, other: CatalogueStar) -> float | None:
-        """Arcsec between the coordinates of two headers; None if one has none."""
+        """Arcsec between the coordinates of two headers at one epoch; None if one has none.
+
+        TARG_RA and TARG_DEC are of the catalogue's epoch in some headers and of the exposure in
+        others, and no card says which: the separation is the least of those that are possible.
+        """
         if self.coordinates is None or other.coordinates is None:
             return None
-        places = np.deg2rad([*self.coordinates, *other.coordinates])
-        return float(np.rad2deg(angular_separation(*places)) * 3600)
+        year = max((*self.epochs, *other.epochs), default=_OLDEST)
+        one, two = self._places(year, other.motion), other._places(year, self.motion)
+        apart = angular_separation(*one[:, :, None], *two[:, None])
+        return float(np.rad2deg(apart.min()) * 3600)
+
+    def _places(self, year: float, motion: tuple[float, float] | None) -> NDArray[np.float64]:
+        """RA and Dec in radians in a year, (2, epochs); `motion` is used where there is no own."""
+        east, north = self.motion or motion or (0.0, 0.0)
+        rate = np.deg2rad(np.hypot(east, north) / 3600)
+        years = year - np.array(self.epochs or (_OLDEST, year))
+        place = np.deg2rad(self.coordinates or (0.0, 0.0))
+        moved = offset_by(*place, np.arctan2(east, north), rate * years)
+        return np.array([each.radian for each in moved])
 
     def is_same(self, other: CatalogueStar) -> bool:
         """Whether two headers describe one star: coordinates decide, names where there are none."""
@@ -171,12 +208,22 @@ class CatalogueStar:
         if apart is None:
             return alike
         coarse = alike or self.pointing or other.pointing
-        return apart < (_SAME_POINTING if coarse else _SAME_PLACE)
+        limit = _SAME_POINTING if coarse else _SAME_PLACE
+        if alike and self.motion is None and other.motion is None:
+            # As far as a star may have moved since the epoch of a catalogue.
+            latest = max((*self.epochs, *other.epochs), default=_OLDEST)
+            limit = max(limit, _FASTEST * (latest - _OLDEST))
+        return apart < limit
 
 
 def star_of(header: fits.Header, name: str) -> CatalogueStar:
     """Read which star a header names, and where it is."""
     names = [header_text(header, key, name) for key in ("TARGPROP", "TARGNAME")]
+    motion = _motion(header, name)
+    if motion is not None and np.hypot(*motion) > _FASTEST:
+        motion = None
+    date, since = beginning(header, name), catalogue_epoch(header, name)
+    epochs = [] if date is None else [float(date.jyear)]
     for keys in _COORDINATES:
         place = [header_number(header, key, name) for key in keys]
         # Files without a target have zeros.
@@ -184,14 +231,69 @@ def star_of(header: fits.Header, name: str) -> CatalogueStar:
             ra, dec = (float(each or 0.0) for each in place)
             if not -90 <= dec <= 90:
                 raise card_error(name, keys[1], dec, "a declination in degrees")
-            return CatalogueStar(tuple(filter(None, names)), (ra, dec), keys != _COORDINATES[0])
-    return CatalogueStar(tuple(filter(None, names)))
+            pointing = keys != _COORDINATES[0]
+            if not pointing:
+                epochs.insert(0, _OLDEST if since is None else float(since.jyear))
+            return CatalogueStar(
+                tuple(filter(None, names)), (ra, dec), pointing, motion, tuple(epochs)
+            )
+    return CatalogueStar(tuple(filter(None, names)), motion=motion)
+
+
+def catalogue_epoch(header: fits.Header, name: str) -> Time | None:
+    """Epoch of the catalogue's coordinates (MU_EPOCH), a date or a Julian year; None if unknown."""
+    year = re.fullmatch(r"\s*(\d{4}(?:\.\d*)?)\s*", str(header.get("MU_EPOCH", "")))
+    if year is not None:
+        return Time(float(year[1]), format="jyear")
+    return header_date(header, ("MU_EPOCH",), name)
+
+
+def _motion(header: fits.Header, name: str) -> tuple[float, float] | None:
+    """MU_RA and MU_DEC, arcsec per year; None if not stated, as by two zeros."""
+    east, north = (header_number(header, key, name) for key in ("MU_RA", "MU_DEC"))
+    # Proposals that do not state it have zeros.
+    return None if east is None or north is None or not (east or north) else (east, north)
 
 
 def proper_motion(header: fits.Header, name: str) -> tuple[float, float] | None:
-    """Proper motion of the star, arcsec per year (MU_RA, which includes cos Dec, and MU_DEC)."""
-    east, north = (header_number(header, key, name) for key in ("MU_RA", "MU_DEC"))
-    return None if east is None or north is None else (east, north)
+    """Proper motion of the star, arcsec per year (MU_RA, which includes cos Dec, and MU_DEC).
+
+    None if the header does not state it, as an empty proposal does not with two zeros;
+    CorruptFileError if no star moves as fast.
+    """
+    motion = _motion(header, name)
+    if motion is not None and np.hypot(*motion) > _FASTEST:
+        raise CorruptFileError(
+            f"{name}: MU_RA and MU_DEC are {motion[0]:g} and {motion[1]:g}, expected arcsec per "
+            f"year, less than {_FASTEST:g} in all. If these are milliarcseconds, divide them by "
+            "1000 in the header"
+        )
+    return motion
+
+
+def common_motion(headers: Iterable[tuple[fits.Header, str]]) -> tuple[float, float] | None:
+    """Proper motion of a star, arcsec per year, from several headers with the names of their files.
+
+    It is the mean of what the headers state; None if none of them does. IncompatibleSetupError if
+    two of them disagree.
+    """
+    known = [
+        (name, motion)
+        for header, name in headers
+        if (motion := proper_motion(header, name)) is not None
+    ]
+    for (first, one), (second, other) in combinations(known, 2):
+        if np.hypot(*np.subtract(one, other)) > _SAME_MOTION:
+            raise IncompatibleSetupError(
+                f"the headers disagree on the star's proper motion (MU_RA, MU_DEC, arcsec per "
+                f"year): got {one[0]:g}, {one[1]:g} in {first} and {other[0]:g}, {other[1]:g} in "
+                f"{second}, expected the same to {_SAME_MOTION:g}. Correct them, or give it as "
+                "proper_motion (--proper-motion)"
+            )
+    if not known:
+        return None
+    east, north = np.mean([motion for _, motion in known], axis=0)
+    return float(east), float(north)
 
 
 # The exposure of a file, as its header describes it.

@@ -287,9 +287,18 @@ def judge_integrations(
     """
     group = np.arange(len(data)) if group is None else group
     kept = np.ones(len(data), dtype=bool)
+    remarks = []
+    for k in group:
+        if not valid[k].any():
+            kept[k] = False
+            remarks.append(
+                f"{names[k]} is left out: no pixel is valid. Where the shift of an alignment is "
+                "undone, pixels without a value or a positive error take their neighbours along"
+            )
+    group = group[kept[group]]
     # A single row or column has no slopes.
     if len(group) < _FEW or min(data.shape[1:]) < 2:
-        return Judgement(kept, ())
+        return Judgement(kept, tuple(remarks))
     # The star may move by a twentieth of a pixel between integrations and its light change by 3 %.
     # Larger deviations that are significant are masked; an integration is left out if they are a
     # quarter of the pixels within 3 arcsec of the star, or if its star is 15 % brighter or fainter.
@@ -298,7 +307,6 @@ def judge_integrations(
     rows, columns = np.indices(median.shape)
     x, y = center[group].mean(axis=0)
     near = np.hypot((columns - x) * pixelscale[0], (rows - y) * pixelscale[1]) < _NEAR
-    remarks = []
     # A star that moves by d changes a pixel by its slope times d.
     slopes = np.hypot(*np.gradient(median))
     allowed = _JITTER * slopes + _CHANGE * np.abs(median)

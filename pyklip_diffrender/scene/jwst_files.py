@@ -24,8 +24,8 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.files import read_image
-from pyklip_diffrender.io.headers import header_number, header_text, merged_header
-from pyklip_diffrender.io.units import native_float64, require_finite
+from pyklip_diffrender.io.headers import card_error, header_number, header_text, merged_header
+from pyklip_diffrender.io.units import ARCSEC, native_float64, require_finite
 from pyklip_diffrender.scene.exposure import (
     bar_place,
     beginning,
@@ -354,6 +354,25 @@ _CROPPED = 32
 """Whole pixels beyond which frames were cropped, and not only aligned."""
 
 
+def _checked_place(
+    star: tuple[float, float], stated: Any, shape: tuple[int, ...], name: str
+) -> NDArray[np.float64]:
+    """The place of a star, x, y from 0, which is inside the frame; `stated` is the header's."""
+    place = np.array(star, dtype=float)
+    (ny, nx), (x, y) = shape, place
+    if not (-0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5):
+        raise IncompatibleSetupError(
+            f"{name}: star: got x, y = {x:g}, {y:g}, expected a place in its {nx} x {ny} pixels, "
+            "counted from 0"
+        )
+    if stated is not None and np.abs(place - 1 - np.reshape(stated, (-1, 2))).max() < _CONSISTENT:
+        _log.warning(
+            "%s: star: got x, y = %g, %g, which is where the header has it, but counted from 1; "
+            "expected pixels from 0, %g, %g", name, x, y, x - 1, y - 1
+        )  # fmt: skip
+    return place
+
+
 def read_calints(
     hdus: fits.HDUList,
     path: str | os.PathLike[str],
@@ -398,7 +417,7 @@ def read_calints(
     mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
     details = _details(header, 1 if data.ndim == 2 else len(data), name)
     if star is not None:
-        details["center"] = np.array(star, dtype=float)
+        details["center"] = _checked_place(star, details["center"], data.shape[-2:], name)
     frames = data.reshape(-1, *data.shape[-2:]).shape
     shifts = recorded_shifts(hdus, np.asarray(details["center"], float), frames, name)
     # A star whose position is stated was moved, unless the file has shifts not yet applied.
@@ -503,6 +522,9 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
             f"{name}: PIXAR_A2 is {area}, expected a pixel area in arcsec^2, such as 0.0039. "
             "Correct the header, or fetch the file again"
         )
+    solid, by_area = number("PIXAR_SR", 0.0), area * ARCSEC**2
+    if solid and not 0.9 < solid / by_area < 1.1:
+        raise card_error(name, "PIXAR_SR", solid, f"about {by_area:.3g} sr, by PIXAR_A2")
     detector = detector_of(header, name) or ""
     if detector.startswith("NRC"):
         usual = _SCALES[detector.endswith(("LONG", "5"))]

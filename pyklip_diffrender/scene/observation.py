@@ -647,7 +647,7 @@ class Observation:
             raise NoValidPixelsError(
                 f"{self.name}: no valid pixel within {window.shape[1]} x {window.shape[0]} "
                 "pixels of the star. Check the star centre in the header, or fit more pixels: a "
-                "larger size (--size)"
+                "larger size"
             )
         return part
 
@@ -656,8 +656,10 @@ class Observation:
         if window not in Window(0, 0, self.shape):
             x, y = self.center[0]
             raise ShapeError(
-                f"{self.name}: {window.shape[1]} x {window.shape[0]} pixels about the star at x, "
-                f"y = {x:.1f}, {y:.1f} do not fit into {nx} x {ny}. Choose a smaller size (--size)"
+                f"{self.name}: {window.shape[1]} x {window.shape[0]} pixels about the star do not "
+                f"fit into {nx} x {ny}. It is at x, y = {x:.1f}, {y:.1f}, pixels from 0, with the "
+                "shifts of an alignment undone. Check its place (star), or choose a smaller "
+                "size"
             )
 
     def _cut(self, windows: list[Window]) -> Observation:

@@ -26,6 +26,8 @@ __all__ = [
     "copies",
     "exclude_contradicting",
     "exclude_copies",
+    "not_judged",
+    "why_few_pixels",
     "why_no_star",
     "why_odd_unit",
     "why_other_brightness",
@@ -67,6 +69,10 @@ _AS_BRIGHT = 0.12
 """Contrast from which a source that hides the star is taken for the star itself. It was at most
 0.1 for sources of 0.1 beside real stars, and 0.14 or more for a star 1.5 arcsec off the mask; a
 displacement of 1.2 arcsec and less cannot be told from such a source."""
+
+_AROUND, _VALID = 2.0, 0.75
+"""Radius, arcsec, and the least share of valid pixels within it. The share is 0.999 in real frames,
+and 0.5 after a Fourier shift of errors with an outlier, which rings through the whole frame."""
 
 _POSITIVE = 0.5
 """Least share of light that is positive: 1 for a star, 0 where it was subtracted."""
@@ -122,6 +128,36 @@ _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 Images = Callable[[Observation, float, float], tuple[Image, Image]]
 """Images of a star behind the mask and of a source at a distance (arcsec) from it, as far as
 another distance (arcsec) about the source, such as `scene.simulation.images_of_stars`."""
+
+
+def why_few_pixels(observation: Observation) -> str:
+    """Why the pixels about the star's position say nothing about the star; empty if they do."""
+    ny, nx = observation.shape
+    x, y = observation.mean_center
+    if not (-0.5 <= x < nx - 0.5 and -0.5 <= y < ny - 0.5):
+        return (
+            f"the star's position, pixel ({x:.1f}, {y:.1f}) from 0, is not in the frame of {nx} x "
+            f"{ny} pixels: CRPIX or STARCEN is wrong, or the star was cut off"
+        )
+    share = float(_mean(observation)[2][_distance(observation) < _AROUND].mean())
+    if share >= _VALID:
+        return ""
+    return (
+        f"{share:.0%} of the pixels within {_AROUND:g} arcsec of the star are valid, expected "
+        f"{_VALID:.0%} or more: the others are flagged in DQ, not finite, or have an ERR that is "
+        "not positive. A shift by Fourier transform spreads NaN, and an outlier of ERR, over the "
+        "frame; use the file from before the shift (calints)"
+    )
+
+
+def not_judged(observation: Observation) -> str:
+    """Say what is not known of frames that are too small to judge, see `why_no_star`."""
+    if _stamp(observation) is not None:
+        return ""
+    return (
+        "the frame reaches less than 1.2 arcsec from the star: whether a star is there, and how "
+        "bright it is, was not checked"
+    )
 
 
 def why_no_star(observation: Observation, images: Images) -> str:
@@ -180,8 +216,8 @@ def why_no_star(observation: Observation, images: Images) -> str:
 
 
 _INSIST = (
-    "Look at the frames. If the star is behind the mask, give its place in the file as star "
-    "(--star), x and y in pixels from 0"
+    "Look at the frames. If the star is behind the mask, give its place in the file with the "
+    "option star, x and y in pixels from 0"
 )
 
 
@@ -408,6 +444,13 @@ def _mean(observation: Observation) -> tuple[Image, Image, NDArray[np.bool_]]:
     return combined.data[0], combined.error[0], combined.valid[0]
 
 
+def _distance(observation: Observation) -> Image:
+    """Distances of pixels from the star, (ny, nx), arcsec."""
+    rows, columns = np.indices(observation.shape)
+    x, y = observation.mean_center
+    return np.asarray(np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale)))
+
+
 def _stamp(observation: Observation) -> tuple[Image, Image, Image] | None:
     """Image about the star, distances from it (arcsec), and noise; None for small frames."""
     data, error, valid = _mean(observation)
@@ -420,10 +463,7 @@ def _noise(observation: Observation, *, clipped: bool = True) -> tuple[Image, ND
     """Differences from neighbouring pixels, clipped, and which of them are far from the star."""
     data, _, valid = _mean(observation)
     difference = data - convolve(data, _NEIGHBOURS, mode="nearest")
-    rows, columns = np.indices(data.shape)
-    x, y = observation.mean_center
-    far = np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale)) > _FAR
-    usable = valid & far
+    usable = valid & (_distance(observation) > _FAR)
     typical = float(np.median(np.abs(difference[usable]))) if usable.any() else 0.0
     if typical > 0 and clipped:
         difference = np.clip(difference / typical, -6, 6)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +12,7 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
-from pyklip_diffrender.io.headers import fits_text, set_keyword
+from pyklip_diffrender.io.headers import fits_text, known_number, known_text, set_keyword
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["ccd_data", "primary_hdu", "world_coordinates"]
@@ -83,11 +82,9 @@ def world_coordinates(grid: NDArray[np.float64], observation: Observation) -> fi
         steps = (ends - grid[0, 0][:, None]) / (columns, rows)
     star = 1 - np.linalg.solve(steps, grid[0, 0])
     axes, unit, values = ("X", "Y"), "arcsec", (0.0, 0.0)
-    pointing = [observation.header.get(key) for key in ("CRVAL1", "CRVAL2")]
-    if observation.position_angles is not None and all(
-        isinstance(each, float) and math.isfinite(each) for each in pointing
-    ):
-        axes, unit, values = ("RA---TAN", "DEC--TAN"), "deg", (pointing[0], pointing[1])
+    ra, dec = (known_number(observation.header, key) for key in ("CRVAL1", "CRVAL2"))
+    if observation.position_angles is not None and ra is not None and dec is not None:
+        axes, unit, values = ("RA---TAN", "DEC--TAN"), "deg", (ra, dec)
         # With +y at the angle p east of north, and +x to the west where p is 0: east = -x cos p + y
         # sin p, north = x sin p + y cos p.
         angle = np.deg2rad(observation.position_angle)
@@ -103,7 +100,7 @@ def world_coordinates(grid: NDArray[np.float64], observation: Observation) -> fi
         for j in range(2):
             header[f"CD{k + 1}_{j + 1}"] = float(steps[k, j])
     if unit == "deg":
-        header["RADESYS"] = str(observation.header.get("RADESYS", "ICRS"))
+        header["RADESYS"] = known_text(observation.header, "RADESYS") or "ICRS"
     return header
 
 

@@ -38,6 +38,8 @@ from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.pixel_checks import (
     exclude_contradicting,
     exclude_copies,
+    not_judged,
+    why_few_pixels,
     why_no_star,
     why_odd_unit,
     why_other_brightness,
@@ -141,10 +143,14 @@ def judge_frames(files: Iterable[FrameFile]) -> None:
         observation = each.read()
         if observation is not None:
             each.reason = (
-                why_odd_noise(observation.noise_ratios)
+                why_few_pixels(observation)
+                or why_odd_noise(observation.noise_ratios)
                 or why_odd_unit(observation)
                 or ("" if each.place is not None else why_no_star(observation, images_of_stars))
             )
+            remark = not_judged(observation)
+            if remark:
+                each.observation = replace(observation, remarks=(*observation.remarks, remark))
 
 
 # Sequences: the rolls of a target and the reference stars that go with them.
@@ -230,7 +236,11 @@ class Sequence:
         Parameters
         ----------
         files : path or sequence of path
-            Stage-2 files (calints), spaceKLIP's aligned files, or a folder with either.
+            Stage-2 files (calints), spaceKLIP's aligned files, folders of either, patterns such as
+            "frames/*_calints.fits", or association files of the archive (*_asn.json), of which the
+            members of the types science and psf are used, by paths relative to the file. With
+            both, science is the target and psf are references, whatever the headers say. In a
+            folder, association files are not read.
         target : str, optional
             Name of the target (TARGPROP or TARGNAME), in which case, spaces and dashes do not
             matter. Default the star that is not marked as a reference (IS_PSF), if there is just
@@ -260,6 +270,8 @@ class Sequence:
             contradict each other, and nothing says which are right.
         NoValidPixelsError
             If no frame of the target is left.
+        CorruptFileError
+            If members of an association are missing.
         """
         sequences = cls.by_epoch(
             files, target=target, filter=filter, references=references, star=star

@@ -97,7 +97,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         ny, nx = observation.shape
         raise ShapeError(
             f"{observation.name}: {size} x {size} pixels do not fit into {nx} x {ny}. Choose a "
-            "smaller size (--size)"
+            "smaller size"
         )
     if observation.filter is None:
         raise IncompatibleSetupError(

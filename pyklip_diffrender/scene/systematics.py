@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,26 @@ from pyklip_diffrender.io.files import open_fits, require_new, write_fits
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.scene.exposure import (
+    CatalogueStar,
+    detector_of,
+    flat_field_of,
+    image_mask,
+    star_of,
+)
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["Systematics", "pattern_fields", "pattern_hdus"]
+__all__ = [
+    "HALF_COVERED",
+    "Systematics",
+    "caveat",
+    "contradiction",
+    "pattern_fields",
+    "pattern_hdus",
+    "require_pattern_of",
+    "shows_star",
+    "unrecorded",
+]
 
 _PROVENANCE = ("stars", "frames", "dates")
 
@@ -43,6 +60,8 @@ def pattern_hdus(
         header["COLUMN"], header["ROW"] = source.first_pixel
     header["PEDESTAL"] = (source.pedestal, "added to the star, then multiplied")
     header["FILTER"], header["CORONMSK"] = source.filter or "", source.image_mask or ""
+    header["DETECTOR"] = source.detector or ""
+    header["R_FLAT"] = (source.flat or "", "flat field of the frames' calibration")
     return hdus
 
 
@@ -57,7 +76,128 @@ def pattern_fields(hdus: fits.HDUList, version: int = 1) -> dict[str, Any]:
         "first_pixel": (header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
         "filter": header["FILTER"] or None,
         "image_mask": header["CORONMSK"] or None,
+        # Files of earlier versions do not have these two.
+        "detector": header.get("DETECTOR") or None,
+        "flat": header.get("R_FLAT") or None,
     }
+
+
+def _star_from(facts: dict[str, Any]) -> CatalogueStar:
+    """The star that `asdict` has made a dict of, whose tuples JSON keeps as lists."""
+    known: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in facts.items()
+    }
+    return CatalogueStar(**known)
+
+
+# Whether something that was learned from frames is for other frames.
+
+HALF_COVERED = 0.5
+"""Smallest part of a frame's pixels that a pattern must cover to be chosen; one that was given and
+covers less has a remark."""
+
+# `learned` is a pattern or the fit of a reference star: it has filter, image_mask, detector and
+# flat, None where not known, and stars and names of frames.
+
+
+def shows_star(learned: Any, observation: Observation) -> bool:
+    """Whether something was learned from frames of the star of an observation."""
+    own = star_of(observation.header, observation.name)
+    if any(
+        star.is_same(own) or any(star.is_called(name) for name in own.names)
+        for star in learned.stars
+    ):
+        return True
+    # A header without a star, and a name that somebody has given: of a file, usually.
+    return observation.name != Observation.name and observation.name in learned.frames
+
+
+def _aspects(
+    learned: Any, observation: Observation
+) -> tuple[tuple[str, str | None, str | None], ...]:
+    """Names of the properties that have to agree, each as learned and as of the observation."""
+    header, name = observation.header, observation.name
+    return (
+        ("filter", learned.filter, observation.filter),
+        ("mask", learned.image_mask, image_mask(header, name)),
+        ("detector", learned.detector, detector_of(header, name)),
+    )
+
+
+def contradiction(learned: Any, observation: Observation) -> tuple[str, str, str] | None:
+    """The first property in which frames differ, as learned and as observed; None if none does.
+
+    The properties are filter, mask and detector. What is not recorded does not differ.
+    """
+    return next(
+        (
+            (aspect, before, now)
+            for aspect, before, now in _aspects(learned, observation)
+            if before is not None and now is not None and before != now
+        ),
+        None,
+    )
+
+
+def unrecorded(learned: Any, observation: Observation) -> list[str]:
+    """The properties that cannot be compared because one of the two does not state them."""
+    header = observation.header
+    stars = [star_of(header, observation.name), *learned.stars]
+    missing = [
+        each for each, before, now in _aspects(learned, observation) if None in (before, now)
+    ]
+    if not learned.stars or not all(star.is_known for star in stars):
+        missing.append("star")
+    if None in (learned.flat, flat_field_of(header, observation.name)):
+        missing.append("flat field")
+    return missing
+
+
+def caveat(systematics: Systematics, observation: Observation) -> str:
+    """What speaks against relying on a pattern that is used; empty if nothing does.
+
+    It is said of patterns with values: one of which only the size is known is of the frames.
+    """
+    if not systematics.pattern.any():
+        return ""
+    remarks, missing = [], unrecorded(systematics, observation)
+    if missing:
+        remarks.append(
+            f"not compared, because pattern or frames do not say it: {', '.join(missing)}"
+        )
+    covered = systematics.covered(observation)
+    if covered < HALF_COVERED:
+        remarks.append(f"covers {100 * covered:.0f} % of the pixels")
+    return "; ".join(remarks)
+
+
+def require_pattern_of(systematics: Systematics, observation: Observation) -> None:
+    """Raise IncompatibleSetupError for a pattern that cannot be that of an observation's pixels.
+
+    It is refused for another filter, mask or detector, where it covers no pixel, and if it was
+    learned from the star of the observation.
+    """
+    name = f"systematics: the pattern {systematics.name!r}"
+    differing = contradiction(systematics, observation)
+    if differing is not None:
+        aspect, before, now = differing
+        raise IncompatibleSetupError(
+            f"{name} was learned with the {aspect} {before}, and {observation.name} has the "
+            f"{aspect} {now}. Give a pattern of the same {aspect}, or 'auto'"
+        )
+    if shows_star(systematics, observation):
+        raise IncompatibleSetupError(
+            f"{name} was learned from frames of {observation.target}, the star of "
+            f"{observation.name}: its planets are part of the pattern, and would be subtracted "
+            "with it. Give a pattern of other stars, or 'auto'"
+        )
+    if systematics.covered(observation) == 0:
+        (ny, nx), (rows, columns) = observation.shape, systematics.pattern.shape
+        raise IncompatibleSetupError(
+            f"{name} has none of the pixels of {observation.name}: it has {columns} x {rows} from "
+            f"{systematics.first_pixel} on (column and row on the detector), the frame {nx} x {ny} "
+            f"from {observation.first_pixel} on. Give a pattern of the same subarray, or 'auto'"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +229,12 @@ class Systematics:
         current.
     first_pixel : tuple of int or None
         Column and row of the pattern's first pixel on the full detector, as of an `Observation`.
-    filter, image_mask : str or None
+    filter, image_mask, detector : str or None
         Set-up that it is for; None where it is not known.
+    flat : str or None
+        Flat field with which the frames were calibrated that it was learned from (R_FLAT).
+    catalogue : tuple of CatalogueStar
+        Names and coordinates of the stars that it was learned from.
     name : str
         Short label for headers.
     provenance : dict
@@ -115,6 +259,9 @@ class Systematics:
     image_mask: str | None = None
     name: str = "systematics"
     provenance: dict[str, Any] = field(default_factory=dict)
+    detector: str | None = None
+    flat: str | None = None
+    catalogue: tuple[CatalogueStar, ...] = ()
 
     def __post_init__(self) -> None:
         if self.pattern.ndim != 2 or self.pattern.shape != self.error.shape:
@@ -140,6 +287,18 @@ class Systematics:
             },
         )
 
+    @property
+    def stars(self) -> tuple[CatalogueStar, ...]:
+        """The stars that it was learned from; by name alone where no catalogue is known."""
+        return self.catalogue or tuple(
+            CatalogueStar((str(name),)) for name in self.provenance.get("stars", ())
+        )
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the frames that it was learned from."""
+        return tuple(self.provenance.get("frames", ()))
+
     def to_hdus(self) -> list[Any]:
         """Return the FITS extensions PATTERN and PATTERN_ERROR."""
         hdus = pattern_hdus(self.pattern, self.error, self)
@@ -148,6 +307,8 @@ class Systematics:
         header["UNKNOWN"] = (self.unknown, "deviation where nothing was measured")
         for key, value in self.provenance.items():
             header[f"HIERARCH {key.upper()}"] = json.dumps(value)
+        if self.catalogue:
+            header["CATALOG"] = json.dumps([asdict(star) for star in self.catalogue])
         return hdus
 
     @classmethod
@@ -161,6 +322,7 @@ class Systematics:
             provenance={
                 key: json.loads(header[key.upper()]) for key in _PROVENANCE if key.upper() in header
             },
+            catalogue=tuple(map(_star_from, json.loads(header.get("CATALOG", "[]")))),
         )
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
@@ -168,7 +330,7 @@ class Systematics:
 
         PATTERN is residual over star, PATTERN_ERROR its standard deviation. The header of PATTERN
         has STARX and STARY (position of the star, 0-indexed), COLUMN and ROW (first pixel on the
-        detector), PEDESTAL, FILTER and CORONMSK.
+        detector), PEDESTAL, FILTER, CORONMSK, DETECTOR, R_FLAT, and the stars.
 
         Parameters
         ----------
@@ -197,35 +359,18 @@ class Systematics:
         with open_fits(path) as hdus:
             try:
                 return cls.from_hdus(hdus)
-            except (KeyError, ValueError) as error:
+            except (KeyError, TypeError, ValueError) as error:
                 raise CorruptFileError(
                     f"{Path(path).name}: not a complete systematics file ({error}); expected one "
                     "written by Systematics.write"
                 ) from error
 
-    def at(self, observation: Observation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the pattern and its error on the pixels of an observation.
+    def _box(self, observation: Observation) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """Rows and columns that pattern and observation share: in the observation, in the pattern.
 
         Pixels are matched on the detector where both sides know which ones they have, else by the
         position of the star, to the nearest whole pixel.
-
-        Returns
-        -------
-        pattern, error : ndarray, (ny, nx)
-            Where nothing was measured the pattern is 0 and its error `unknown`.
-
-        Raises
-        ------
-        IncompatibleSetupError
-            If the observation was taken through another filter.
         """
-        if None not in (self.filter, observation.filter) and self.filter != observation.filter:
-            raise IncompatibleSetupError(
-                f"{observation.name}: these frames were taken through {observation.filter}, the "
-                f"systematics {self.name!r} were learned in {self.filter}"
-            )
-        pattern = np.zeros(observation.shape)
-        error = np.full(observation.shape, self.unknown)
         if self.first_pixel is not None and observation.first_pixel is not None:
             x, y = np.subtract(self.first_pixel, observation.first_pixel)
         else:
@@ -239,6 +384,26 @@ class Systematics:
             slice(rows.start - y, rows.stop - y),
             slice(columns.start - x, columns.stop - x),
         )
-        pattern[rows, columns] = self.pattern[own]
-        error[rows, columns] = self.error[own]
+        return (rows, columns), own
+
+    def covered(self, observation: Observation) -> float:
+        """The part of the pixels of an observation that the pattern has."""
+        return self.pattern[self._box(observation)[1]].size / np.prod(observation.shape)
+
+    def at(self, observation: Observation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the pattern and its error on the pixels of an observation.
+
+        Pixels are matched on the detector where both sides know which ones they have, else by the
+        position of the star, to the nearest whole pixel.
+
+        Returns
+        -------
+        pattern, error : ndarray, (ny, nx)
+            Where nothing was measured the pattern is 0 and its error `unknown`.
+        """
+        pattern = np.zeros(observation.shape)
+        error = np.full(observation.shape, self.unknown)
+        there, own = self._box(observation)
+        pattern[there] = self.pattern[own]
+        error[there] = self.error[own]
         return pattern, error

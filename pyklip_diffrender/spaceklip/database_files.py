@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Iterable
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.io.headers import fits_text, known_number
 from pyklip_diffrender.pyklip_backend.output_files import on_product
 
 __all__ = [
@@ -82,6 +84,21 @@ _COLUMNS = (
 """Columns of the database that spaceKLIP reads from the header of a product."""
 
 
+def _values(table: Table, name: str) -> list[str | float | None]:
+    """Values of a column as headers can hold them: text, finite numbers, or None."""
+    # spaceKLIP copies cards into its columns as they are: masked, None, or text for a number.
+    cells = table[name] if name in table.colnames else [None] * len(table)
+    values: list[str | float | None] = []
+    for each in cells:
+        cell = each.item() if isinstance(each, np.generic) else each
+        if isinstance(cell, str):
+            values.append(fits_text(cell))
+        else:
+            is_number = isinstance(cell, int | float) and math.isfinite(cell)
+            values.append(cell if is_number else None)
+    return values
+
+
 def complete_header(product: Path, table: Table, mode: str) -> None:
     """Add the keywords of spaceKLIP's products, and a WCS, to the header of a product.
 
@@ -89,22 +106,31 @@ def complete_header(product: Path, table: Table, mode: str) -> None:
     """
     science = table[np.array(table["TYPE"], dtype=str) == "SCI"]
     frame = fits.getheader(science["FITSFILE"][0], "SCI")
+    place = [known_number(frame, key) for key in ("CRVAL1", "CRVAL2", "PIXAR_A2")]
     with fits.open(product, mode="update", memmap=False) as hdus:
         header = hdus[0].header
         for name in _COLUMNS:
-            value = science[name][0] if name in science.colnames else np.nan
+            value = _values(science, name)[0]
             # FITS has no NaN in headers; spaceKLIP takes a missing keyword for one.
-            if isinstance(value, str) or np.isfinite(value):
-                header[name] = value.item() if isinstance(value, np.generic) else value
-        header["EXPSTART"] = float(np.min(science["EXPSTART"]))
-        header["NINTS"] = int(np.sum(science["NINTS"]))
+            if value is not None:
+                header[name] = value
+        starts, counts = (
+            [each for each in _values(science, name) if isinstance(each, int | float)]
+            for name in ("EXPSTART", "NINTS")
+        )
+        if starts:
+            header["EXPSTART"] = float(min(starts))
+        header["NINTS"] = int(sum(counts))
         header["MODE"], header["ANNULI"], header["SUBSECTS"] = mode, 1, 1
-        degrees = float(science["PIXSCALE"][0]) / 3600
+        if None in place:
+            return
+        *pointing, area = (float(each or 0.0) for each in place)
+        degrees = area**0.5 / 3600
         header["WCSAXES"] = 2
         for axis, (name, sign) in enumerate((("RA---TAN", -1), ("DEC--TAN", 1)), 1):
             header[f"CTYPE{axis}"], header[f"CUNIT{axis}"] = name, "deg"
             header[f"CRPIX{axis}"] = header["PSFCENTX" if axis == 1 else "PSFCENTY"] + 1
-            header[f"CRVAL{axis}"] = frame[f"CRVAL{axis}"]
+            header[f"CRVAL{axis}"] = pointing[axis - 1]
             for other in (1, 2):
                 header[f"CD{axis}_{other}"] = sign * degrees if other == axis else 0.0
 
@@ -173,7 +199,8 @@ def write_mask(path: Path, table: Table) -> None:
     Raises ImportError if it has, and spaceKLIP, which turns them, is not installed.
     """
     science = table[np.array(table["TYPE"], dtype=str) == "SCI"]
-    if "NONE" in list(science["MASKFILE"]):
+    files = _values(science, "MASKFILE")
+    if not all(isinstance(each, str) and each != "NONE" for each in files):
         return
     from spaceKLIP.psf import get_transmission
 

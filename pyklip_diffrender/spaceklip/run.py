@@ -24,7 +24,8 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.headers import file_name
-from pyklip_diffrender.options import OPTIONS, ReduceOptions
+from pyklip_diffrender.options import ReduceOptions
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.pyklip_backend.source_frames import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.reduction import SPECTRA, by_star, in_words, search_together
@@ -136,7 +137,10 @@ def run_obs(
     Raises
     ------
     IncompatibleSetupError
-        For a `star_flux` that is no flux density, or of a filter that the database does not have.
+        For a `star_flux` that is no flux density, or of a filter that the database does not have,
+        and for values that `DiffrenderSettings` refuses.
+    TypeError
+        For a name that is no field of it.
     ExceptionGroup
         After all concatenations, if some failed: their errors, each with a note that names the
         concatenation. The log has the tracebacks, and the others are complete.
@@ -156,8 +160,9 @@ def run_obs(
     >>> spaceklip.run_obs(database, opd="maps")  # doctest: +SKIP
     """
     fluxes = _fluxes(star_flux or {}, database)
-    OPTIONS["threshold"].checked(threshold)
-    OPTIONS["star_flux_error"].checked(star_flux_error)
+    # What is wrong in them is said before the first file is read.
+    common = {"opd": opd, "threshold": threshold, "star_flux_error": star_flux_error, **settings}
+    DiffrenderSettings(**common)
     folder = Path(database.output_dir) / subdir
     folder.mkdir(parents=True, exist_ok=True)
     products: dict[str, Path] = {}
@@ -186,14 +191,7 @@ def run_obs(
                 judged,
                 folder,
                 save_rolls,
-                {
-                    "opd": opd,
-                    "verbose": verbose,
-                    "threshold": threshold,
-                    "star_flux": fluxes.get(_filter(table)),
-                    "star_flux_error": star_flux_error,
-                    **settings,
-                },
+                {**common, "verbose": verbose, "star_flux": fluxes.get(_filter(table))},
             )
         except Exception as error:  # Reported after the other concatenations.
             logger.exception("concatenation %s failed", key)

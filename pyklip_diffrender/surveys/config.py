@@ -16,6 +16,7 @@ from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, Incompat
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.units import full_circle
 from pyklip_diffrender.options import OPTIONS, SharedOptions
+from pyklip_diffrender.scene.associations import matches
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
 __all__ = [
@@ -99,6 +100,11 @@ class CheckedTable:
         if not exists:
             raise ValueError(str(path))
         return path.absolute()
+
+    def matching(self, value: Any) -> list[Path]:
+        """Paths of a pattern, or the one that exists, relative to the configuration's folder."""
+        found = matches(self.folder / as_text(value))
+        return [self.existing(str(path.absolute())) for path in found]
 
     def finish(self) -> None:
         """Complain about keys that nobody took."""
@@ -238,7 +244,7 @@ class SequenceConfig:
     is_named : bool
         Whether the configuration has given the name. Tables have target and filter otherwise.
     files : tuple of Path
-        Files, or one folder.
+        Files, association files and folders.
     opd : Path
         A wavefront map, or a folder of maps, of which the nearest in time is used; ``Path("flat")``
         for a flat wavefront.
@@ -352,15 +358,15 @@ def _config(top: CheckedTable) -> Config:
 def _sequence(
     table: CheckedTable, options: Options, injections: Injections
 ) -> SequenceConfig | None:
-    expected = "FITS files, or one folder of them, that exist; paths are relative to the folder of "
-    expected += "the configuration"
+    expected = "FITS files, folders of them, patterns such as frames/*_calints.fits or association "
+    expected += "files that exist; paths are relative to the folder of the configuration"
 
     def paths(value: Any) -> tuple[Path, ...]:
         several = value if isinstance(value, list) else [value]
-        existing = tuple(table.existing(each) for each in several)
-        if not existing or (len(existing) > 1 and any(each.is_dir() for each in existing)):
+        found = tuple(path for each in several for path in table.matching(each))
+        if not found:
             raise ValueError
-        return existing
+        return found
 
     missing: list[Any] = [key for key in ("files", "opd") if key not in table.content]
     for key in missing:
@@ -389,13 +395,22 @@ def _sequence(
 
 
 def _options(table: CheckedTable, default: Options) -> Options:
-    def path(choices: tuple[str, ...], value: Any) -> str:
-        return str(value) if value in choices else str(table.existing(value))
+    def pattern(choices: tuple[str, ...], value: Any) -> str:
+        if value in choices:
+            return str(value)
+        # Late, see `_wrong_settings`. Files without patterns are found before any job begins.
+        from pyklip_diffrender.pattern import as_request
+
+        try:
+            as_request(table.existing(value))
+        except DiffrenderError as error:
+            raise ValueError(str(error)) from error
+        return str(table.existing(value))
 
     values: dict[str, Any] = {}
     for name in default.keywords:
         each = OPTIONS[name]
-        convert = partial(path, each.choices) if each.path else each.checked
+        convert = partial(pattern, each.choices) if each.path else each.checked
         values[name] = table.take(name, getattr(default, name), each.expected, convert)
     if values["wide"] and values["disk"]:
         table.complain("", "wide = true and disk = true", "one of them")
@@ -432,7 +447,10 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
 def _injections(table: CheckedTable, default: Injections) -> Injections:
     own = bool(table.content)
     numbers = "a list of positive numbers, such as [1e-5]"
-    contrasts = table.take("contrasts", default.contrasts, numbers, list_of(as_positive))
+    contrasts = table.take(
+        "contrasts", default.contrasts, f"{numbers}, fluxes over the star's and no magnitudes",
+        list_of(only(as_positive, lambda contrast: contrast < 1)),
+    )  # fmt: skip
     separations = table.take("separations", default.separations, numbers, list_of(as_positive))
     angles = table.take(
         "angles", default.angles, "a list of degrees east of north", only(list_of(as_number), bool)

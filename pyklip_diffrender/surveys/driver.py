@@ -125,6 +125,18 @@ def run_survey(
     board = _Board(todo, output)
     missing = [job for job in todo if not board.has(job)]
     _log.info("%d of %d jobs are finished", len(todo) - len(missing), len(todo))
+    labels = {path.name.rpartition("_")[0] for path in jobs.iterdir()}
+    again = [
+        job
+        for job in missing
+        if job.key not in board.records and job.folder.rpartition("_")[0] in labels
+    ]
+    if again:
+        _log.warning(
+            "%d jobs are done again, because their files, their options, the version of the "
+            "package or their products are not as they were: %s",
+            len(again), "; ".join(map(str, again)),
+        )  # fmt: skip
     try:
         with (
             tqdm(total=len(missing), desc="survey", disable=not progress) as bar,

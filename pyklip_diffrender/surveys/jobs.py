@@ -20,6 +20,8 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import fits_files, read_text, sha256
 from pyklip_diffrender.io.headers import file_name
+from pyklip_diffrender.io.units import to_bytes
+from pyklip_diffrender.scene.associations import listed_files
 from pyklip_diffrender.scene.sequence import epochs_of_files
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
 from pyklip_diffrender.wavefront.opd import wavefront_for
@@ -118,7 +120,7 @@ def jobs_of(config: Config) -> list[Job]:
     digest = cache(sha256)
     for sequence in config.sequences:
         try:
-            planned = _jobs(sequence, digest)
+            planned = _jobs(sequence, digest, config.memory_limit)
         except (DiffrenderError, OSError) as error:
             problems.append(f"{sequence.name}: {error}")
             continue
@@ -136,12 +138,14 @@ def jobs_of(config: Config) -> list[Job]:
     return list(jobs.values())
 
 
-def _jobs(sequence: SequenceConfig, digest: Callable[[Path], str]) -> list[Job]:
+def _jobs(
+    sequence: SequenceConfig, digest: Callable[[Path], str], memory_limit: str | None
+) -> list[Job]:
     files = _files(sequence.files)
     planets = sequence.injections
     jobs = []
     for opd, epoch, name, filter in _epochs(sequence, files):
-        plain = _job(replace(sequence, name=name), files, opd, epoch, digest)
+        plain = _job(replace(sequence, name=name), files, opd, epoch, digest, memory_limit)
         plain = replace(plain, filter=filter)
         injected = [
             _with_planet(plain, Injection(contrast, separation, angle))
@@ -184,12 +188,16 @@ def _job(
     opd: Path,
     epoch: str | None,
     digest: Callable[[Path], str],
+    memory_limit: str | None,
 ) -> Job:
     options, usual = sequence.options, Options()
     pattern = str(options.systematics)
     known = [] if pattern in ("auto", "references", "off") else _files((Path(pattern),))
     maps = [] if str(opd) == FLAT else [opd]
-    inputs = {str(path): digest(path) for path in (*files, *maps, *known)}
+    # Members of associations are inputs as well.
+    members = [each.path for each in listed_files(files) if not each.reason]
+    frames = dict.fromkeys((*files, *members))
+    inputs = {str(path): digest(path) for path in (*frames, *maps, *known)}
     chosen = {
         name: value
         for name, value in vars(options).items()
@@ -199,10 +207,13 @@ def _job(
     chosen.pop("star_flux_error", None)
     if options.star_flux is not None:
         chosen["star_flux"] = [options.star_flux, options.star_flux_error]
+    # Frames of reference stars for which there is no memory are left out.
+    if memory_limit is not None and options.references == "joint" and not options.disk:
+        chosen["memory_limit"] = to_bytes(memory_limit, "memory_limit")
     facts = {
         **chosen,
         "version": __version__,
-        "frames": sorted(inputs[str(path)] for path in files),
+        "frames": sorted(inputs[str(path)] for path in frames),
         "opd": inputs.get(str(opd), FLAT),
         "target": sequence.target,
         "filter": sequence.filter,
@@ -240,13 +251,14 @@ def hash_of(facts: Mapping[str, Any]) -> str:
 
 
 def _files(paths: tuple[Path, ...]) -> list[Path]:
-    """Files of a folder, or the files themselves."""
-    if len(paths) > 1 or not paths[0].is_dir():
-        return list(paths)
-    inside = fits_files(paths[0])
-    if not inside:
-        raise CorruptFileError(f"{paths[0]}: the folder has no FITS files")
-    return inside
+    """The files themselves, and those of folders."""
+    files: list[Path] = []
+    for path in paths:
+        inside = fits_files(path) if path.is_dir() else [path]
+        if not inside:
+            raise CorruptFileError(f"{path}: the folder has no FITS files")
+        files += inside
+    return files
 
 
 # Folders of finished jobs: there whole or not at all, whoever is killed when.

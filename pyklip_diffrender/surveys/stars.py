@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,6 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.scene.exposure import proper_motion
 from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staging
 
 __all__ = ["FOLDER", "StarSearch", "search_stars"]
@@ -121,10 +121,20 @@ def _search(star: str, group: Group, output: Path, spectra: Sequence[str]) -> St
     final = output / FOLDER / folder_of(star, key)
     names = tuple(str(job) for job, _ in group)
     data = final / COMPARISON[1]
-    if not data.exists():
+    combined: Any = _combined_in(data)
+    if combined is None:
+        shutil.rmtree(final, ignore_errors=True)
         _write(star, group, final, spectra)
-    combined = json.loads(read_text(data))["combined"]
+        combined = json.loads(read_text(data))["combined"]
     return StarSearch(star, final.relative_to(output).as_posix(), names, combined)
+
+
+def _combined_in(data: Path) -> Mapping[str, Any] | None:
+    """What ``comparison.json`` has of a search; None if there is no such file, or a damaged one."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        combined: Mapping[str, Any] = json.loads(read_text(data))["combined"]
+        return combined
+    return None
 
 
 def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None:
@@ -132,9 +142,7 @@ def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None
     final.parent.mkdir(exist_ok=True)
     clean(final.parent)
     detections = [each for _, each in group]
-    motions = [proper_motion(each.observation.header, each.observation.name) for each in detections]
-    motion = next((each for each in motions if each is not None), None)
-    combination = search_together(detections, spectra=spectra, motion=motion)
+    combination = search_together(detections, spectra=spectra)
     _log.info("%s: %s", star, in_words(combination))
     jobs = final.parent.parent / "jobs"
     summaries = {
@@ -146,7 +154,7 @@ def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None
     try:
         if isinstance(combination, Combination):
             combination.write(folder)
-        write_comparison(summaries, motion, folder, combination)
+        write_comparison(summaries, folder, combination)
         os.rename(folder, final)
     except OSError:
         # Another survey of the folder may have been faster.

@@ -31,7 +31,7 @@ from pyklip_diffrender.errors import (
     UnitError,
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil
-from pyklip_diffrender.io.files import BROKEN, fits_files, open_fits, sha256
+from pyklip_diffrender.io.files import BROKEN, fits_files, open_fits, product_in, sha256
 from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
 from pyklip_diffrender.io.units import native_float64, to_metres, to_number, warn_of_rms
 from pyklip_diffrender.optics.grid import PupilGrid, resample
@@ -176,10 +176,14 @@ def _image(hdus: fits.HDUList, extension: str | int | None, path: Path) -> Any:
                 f"{path}: no extension {extension!r}; it has {[h.name for h in hdus]}"
             ) from error
     exposure = str(hdus[0].header.get("EXP_TYPE", "")).strip()
-    if "SCI" in hdus or exposure:
+    product = product_in(hdus)
+    has_map = any(hdu.name in _MAP_NAMES for hdu in hdus)
+    if "SCI" in hdus or exposure or (product and not has_map):
+        what = f"an exposure of type {exposure}" if exposure else "an exposure"
+        if product:
+            what = f"{product}, a product of pyklip_diffrender"
         raise CorruptFileError(
-            f"{path.name}: this is no wavefront map, but an exposure"
-            f"{f' of type {exposure}' if exposure else ''}. Expected a map of the wavefront "
+            f"{path.name}: this is no wavefront map, but {what}. Expected a map of the wavefront "
             "sensing (R2022081102-NRCA3_FP1-1.fits, for example) or another OPD map; frames are "
             "given in place of the frames"
         )

@@ -257,7 +257,7 @@ def load_wss_opd(
             "the file again"
         )
     npix = npix or finest_pupil()
-    aperture = header.get("APERNAME", "")
+    aperture = header_text(header, "APERNAME", path.name) or ""
     pupil = pupil_samples(npix, required=backout_si_wfe is True)
     opd = _interpolated(_gaps_filled(coarse), npix) * TO_METRES[unit.strip().lower()]
     history = [
@@ -341,7 +341,7 @@ def load_wss_opd_by_date(
             f"no wavefront map for {when.isot} from MAST ({type(error).__name__}: {error}). "
             "Where the network does not allow it, download the file elsewhere "
             "(https://mast.stsci.edu, product type OPD) and pass its path to load_wss_opd, or "
-            "to --opd on the command line"
+            "give it as opd"
         ) from error
     maps = [load_wss_opd(path, npix=npix, backout_si_wfe=backout_si_wfe) for path in paths]
     return maps[0] if len(maps) == 1 else interpolate_wss(maps[0], maps[1], when)
