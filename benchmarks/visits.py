@@ -182,7 +182,7 @@ def reduced(visit: Visit, folder: Path) -> dict[str, Any]:
         results[use] = made.compare(visit.case, reduction)
         stars[use] = reduction.fit.frames[0].flux / visit.case.flux
         if use == "joint":
-            used = [each.use == "joint" for each in reduction.visit.contributions]
+            used = [each.use == "wavefront" for each in reduction.visit.contributions]
             remarks = "; ".join(
                 dict.fromkeys(each.reason for each in reduction.visit.contributions if each.reason)
             )

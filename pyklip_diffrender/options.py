@@ -209,10 +209,11 @@ class SharedOptions:
     })  # fmt: skip
     references: References = field(default="joint", metadata={
         "choices": get_args(References),
-        "meaning": """Use of the frames of reference stars. With "joint" they are fitted together
-            with the target's, in one likelihood, if that makes the limits deeper; with "pattern"
-            they teach the flat-field pattern where the library has none; with "off" they are not
-            used. With `disk`, "joint" stands for "pattern".""",
+        "meaning": """Use of the frames of reference stars. With "joint" those of the target's epoch
+            are fitted together with the target's, in one likelihood, if that makes the limits
+            deeper, and those of other epochs teach the flat-field pattern where the library has
+            none; with "pattern" all of them do; with "off" they are not used. With `disk`, "joint"
+            stands for "pattern".""",
         "help": """Use of the frames of reference stars: in one likelihood with the target's, for
             the flat-field pattern, or not at all.""",
     })  # fmt: skip
@@ -220,10 +221,10 @@ class SharedOptions:
         "meaning": "S/N of a candidate.", "help": "S/N of a candidate.", "metavar": "S/N",
     })  # fmt: skip
     wide: bool = field(default=False, metadata={
-        "meaning": """Search the whole frames as well, see `wide_field`. If sources beyond the
-            fitted pixels are bright enough to be seen in these, the star is fitted once more
-            without their light.""",
-        "help": "Search the whole frames as well, to their edge.",
+        "meaning": """Search the whole frames as well, see `wide_field`: of frames of the whole
+            detector, the field of the mask, 20 arcsec wide. If sources beyond the fitted pixels are
+            bright enough to be seen in these, the star is fitted once more without their light.""",
+        "help": "Search the whole frames as well, to their edge or that of the mask's field.",
     })  # fmt: skip
     disk: bool = field(default=False, metadata={
         "meaning": """Fit extended light about the star, see `fit_disk`, and search the frames

@@ -369,10 +369,15 @@ def test_epochs_are_separate_sequences(folder):
         dr.Sequence.from_files(folder)
     first, second = dr.Sequence.by_epoch(folder)
     assert as_before(first)
+    # A reference star teaches the pattern at any epoch; the target's own planets must not.
     assert uses(second) == {
-        "later.fits": "target", FIRST: "excluded", SECOND: "excluded", THIRD: "excluded",
+        "later.fits": "target", FIRST: "excluded", SECOND: "excluded", THIRD: "reference",
     }  # fmt: skip
     assert "another epoch than the frames of 2023-12-01" in reasons(second)[FIRST]
+    for each, epochs in ((first, (1, 0)), (second, (0, 1))):
+        assert (len(each.same_epoch), len(each.other_epochs)) == epochs
+    remarks = dict(zip(second.table["file"], second.table["remark"], strict=True))
+    assert remarks[THIRD].endswith("for the flat-field pattern and KLIP only")
     chosen = dr.Sequence.from_files(folder, epoch="2023-12-02")
     assert [each.name for each in chosen.science] == ["later.fits"]
     with pytest.raises(IncompatibleSetupError, match="epoch: got 2023-02-01, expected one of"):

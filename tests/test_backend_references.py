@@ -133,13 +133,16 @@ def test_references_that_do_not_belong_are_left_out(files, tmp_path, rng):
         # A star's own planets would become part of the pattern.
         "a reference frame that shows the target itself": {"TARGPROP": "target"},
         "EXP_TYPE is NRC_TACQ": {"EXP_TYPE": "NRC_TACQ"},
-        "of another epoch": {"DATE-BEG": "2023-07-30T01:02:03"},
     }
-    library = [Path(files[2]), *written(tmp_path, rng, 0.0, REFERENCE, wrong)]
+    later = {"of another epoch": {"DATE-BEG": "2023-07-30T01:02:03"}}
+    (tmp_path / "later").mkdir()
+    (other,) = written(tmp_path / "later", rng, 0.0, REFERENCE, later)
+    library = [Path(files[2]), *written(tmp_path, rng, 0.0, REFERENCE, wrong), other]
     with pytest.warns(DiffrenderWarning) as caught:
         frames = gathered(JWSTData(files[:2]), library)
     assert_left_out(caught, wrong)
-    assert [each.name for each in frames.references] == [library[0].name]
+    assert any("of another epoch" in str(each.message) for each in caught)
+    assert [each.name for each in frames.references] == [library[0].name, other.name]
     assert frames.usable.all()
 
 

@@ -111,6 +111,21 @@ def refined(small, frames, tmp_path_factory):
     return made, image, header, fits.getdata(folder / "x-throughput.fits", header=True)
 
 
+def test_a_library_that_is_not_used_is_said_with_the_reason(frames, small):
+    observation = Observation.from_arrays(
+        frames, np.sqrt(frames), pixelscale=small.detector.pixelscale, position_angles=[0.0, 90.0]
+    )
+    library = [replace(observation.part(np.array([0])), reference=True, name="a star beside")]
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, references="off", keep_detected=False)
+    with pytest.warns(DiffrenderWarning) as caught:
+        subtracted = subtract_by_refinement(observation, OLD, settings, references=library)
+    said = [str(each.message) for each in caught if "RDI" in str(each.message)]
+    assert "of 1 reference frame 1 not used by the fit" in said[0]
+    assert subtracted.references == 0
+    (contribution,) = subtracted.reduction.visit.contributions
+    assert "the option references is 'off'" in contribution.reason
+
+
 @pytest.mark.slow
 def test_star_goes_companion_stays(small, frames, refined, tmp_path):
     made, image, header, _ = refined
@@ -144,6 +159,7 @@ def test_star_goes_companion_stays(small, frames, refined, tmp_path):
     assert fit.frames == (0, 1)
     assert header["DRCHI2"] == pytest.approx(fit.result.chi2_per_pixel)
     assert (header["DRSYST"], header["DRREFS"]) == ("none", 0)
+    assert header["DRREFUSE"] == "no reference frames"
     assert (header["DROPD"], header["DRSHA256"]) == (OLD.name, OLD.sha256)
 
 

@@ -28,6 +28,7 @@ from pyklip_diffrender.reduction import existing_products, pages, summarise, wri
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.pipeline import looks_extended
 from pyklip_diffrender.reduction.products import page
+from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.product_headers import world_coordinates
 
@@ -329,8 +330,17 @@ def test_with_reference_frames_klip_is_shown_beside(tmp_path):
     star = replace(whole.sequence.science[0], reference=True)
     noise = star.error * np.random.default_rng(1).standard_normal(star.data.shape)
     sequence = replace(whole.sequence, references=(replace(star, data=star.data + noise),))
-    html, data = write_report(replace(whole, sequence=sequence), tmp_path)
-    curve = json.loads(data.read_text(encoding="utf-8"))["klip_curve"]
+    unused = Contribution(star.name, star.target, "not used", "only 1 frame of its star")
+    sequence = replace(sequence, excluded=())
+    beside = replace(whole, sequence=sequence, failed=(), visit=Visit((unused,)))
+    html, data = write_report(beside, tmp_path)
+    summary = json.loads(data.read_text(encoding="utf-8"))
+    curve = summary["klip_curve"]
+    assert [each["use"] for each in summary["frames"]] == ["target", "KLIP only"]
+    page = " ".join(html.read_text(encoding="utf-8").split())
+    assert "1 frame of reference stars: 1 KLIP only" in page
+    assert "only 1 frame of its star" in page
+    assert "No file was left out, but 1 reference frame took no part in the fit" in page
     assert set(curve) == {
         "sigmas", "separation_arcsec", "contrast", "small_sample", "modes", "throughput",
     }  # fmt: skip

@@ -191,9 +191,9 @@ def test_a_quick_reduction_is_smaller_and_coarser_where_the_star_is_fainter():
     assert [round(faintness(each)) for each in (bright, fainter, faint)] == [1, 10, 200]
     cycles = [quick_settings(each).cycles[0] for each in (bright, fainter, faint)]
     assert settings_for(bright).cycles[0] > cycles[0] > cycles[1] > cycles[2]
-    assert coarse_arguments(bright, 80) == {"nlambda": 7, "npix": 128}
-    assert coarse_arguments(faint, 80)["nlambda"] == 3
-    assert coarse_arguments(bright, 320)["npix"] == 256
+    assert coarse_arguments(bright, (80, 80)) == {"nlambda": 7, "npix": 128}
+    assert coarse_arguments(faint, (80, 80))["nlambda"] == 3
+    assert coarse_arguments(bright, (320, 80))["npix"] == 256
     for wrong in ({"accuracy": "fast"}, {"accuracy": "quick", "settings": dr.GaussNewton()}):
         with pytest.raises(IncompatibleSetupError, match="accuracy"):
             ReduceOptions(**wrong)

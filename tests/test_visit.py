@@ -10,16 +10,27 @@ from astropy.io import fits
 from astropy.time import Time
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.cli.reducing import describe_steps
 from pyklip_diffrender.detection import sources_of_references
 from pyklip_diffrender.detection.error_factor import structures_in_single_roll
-from pyklip_diffrender.pattern import choose_systematics, pattern_for_visit
-from pyklip_diffrender.reduction import Visit
+from pyklip_diffrender.pattern import (
+    PatternLibrary,
+    choose_systematics,
+    is_known_beside,
+    known_systematics,
+    measure_patterns,
+    pattern_for_visit,
+)
+from pyklip_diffrender.reduction import ReduceOptions, Visit, pipeline
 from pyklip_diffrender.reduction import visit as visits
+from pyklip_diffrender.reduction.klip import klip_curve
+from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.reduction.visit import with_references
 from pyklip_diffrender.refinement import GaussNewton, align_frame, join_frames, refine
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.settings import exposure_sequences
 from pyklip_diffrender.scene import Observation, Planet
+from pyklip_diffrender.scene.exposure import CatalogueStar
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 SIZE, NPIX = 32, 64
@@ -115,7 +126,7 @@ def candidate_of(detection):
 
 def test_references_make_the_limits_deeper_and_leave_the_planet_alone():
     fit, visit, used = joined(*(reference(k) for k in range(3)))
-    assert used == ["joint"] * 3
+    assert used == ["wavefront"] * 3
     assert visit.gain == pytest.approx(limit(alone()[1]) / limit(fit), rel=0.1)
     assert visit.gain > 1.15
     for each in visit.contributions:
@@ -135,7 +146,7 @@ def test_references_make_the_limits_deeper_and_leave_the_planet_alone():
 def test_a_companion_of_a_reference_is_masked_and_named(contrast):
     """One that the joint fit shows, and one without which the frames would not be in it."""
     fit, visit, used = joined(*(reference(k, companion=contrast) for k in range(2)))
-    assert used == ["joint"] * 2
+    assert used == ["wavefront"] * 2
     assert visit.gain > 1.1
     for each in visit.contributions:
         assert "arcsec is subtracted and masked" in each.reason
@@ -152,7 +163,7 @@ def test_a_companion_of_a_reference_is_masked_and_named(contrast):
 
 def test_a_reference_with_another_wavefront_does_not_take_part():
     fit, visit, used = joined(reference(0), reference(1, drift=4e-8))
-    assert used == ["joint", "left out"]
+    assert used == ["wavefront", "not used"]
     assert "is not explained" in visit.contributions[1].reason
     assert len(fit.frames) == 3
 
@@ -163,7 +174,7 @@ def test_a_reference_that_contradicts_the_target_is_left_out_by_name(monkeypatch
     turned = reference(1)
     turned = replace(turned, data=turned.data[:, ::-1].copy(), name="mirrored")
     fit, visit, used = joined(reference(0), turned)
-    assert used == ["joint", "left out"]
+    assert used == ["wavefront", "not used"]
     assert "chi-squared" in visit.contributions[1].reason
     assert [part.observation.name for part in fit.frames] == ["HD 1 1", "HD 1 2", "HD 2 4"]
 
@@ -171,7 +182,7 @@ def test_a_reference_that_contradicts_the_target_is_left_out_by_name(monkeypatch
 def test_the_fit_of_the_target_is_kept_where_references_do_not_help():
     fit, visit, used = joined(reference(0, brightness=0.01))
     assert fit is alone()[1]
-    assert used == ["left out"]
+    assert used == ["not used"]
     assert "of the target's flux" in visit.contributions[0].reason
     assert joined() == (alone()[1], Visit(), [])
 
@@ -189,7 +200,7 @@ def test_limits_are_compared_as_they_are_stated():
     frames = [reference(k) for k in range(3)]
     kept, visit, detection = with_references(fit, choice, frames[:2], search=search)
     assert (kept, detection) == (fit, None)
-    assert "add little to the library's pattern" in visit.contributions[0].reason
+    assert "only 2 frames of its star" in visit.contributions[0].reason
     kept, visit, detection = with_references(fit, choice, frames, search=search)
     assert searched[0] is fit
     assert len(searched) == 2
@@ -208,7 +219,7 @@ def test_frames_that_do_not_fit_into_the_memory_are_left_out(caplog):
     choice, fit = alone()
     fit = replace(fit, settings=replace(fit.settings, memory=memory))
     _, visit, _ = with_references(fit, choice, [reference(0), reference(1)], memory=memory)
-    assert [each.use for each in visit.contributions] == ["joint", "left out"]
+    assert [each.use for each in visit.contributions] == ["wavefront", "not used"]
     assert "memory" in visit.contributions[1].reason
     assert "GB of the option memory" in caplog.text
 
@@ -265,6 +276,143 @@ def test_a_pattern_is_not_learned_twice_from_a_reference():
     assert pattern(origin="off", systematics=None) is None
     elsewhere = [reference(0, first_pixel=(700, 1600))]
     assert pattern_for_visit(replace(choice, origin="none"), science()[:1], elsewhere) is None
+
+
+TEACHING, TOGETHER = "reference star HD 2", "reference stars and target together"
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "options", "planned"),
+    [
+        (3, 0, {}, [TOGETHER]),
+        (1, 0, {}, [TOGETHER]),
+        # Where the pattern is known, one frame of a star is not worth the time.
+        (1, 2, {}, [TEACHING]),
+        (3, 2, {}, [TEACHING, TOGETHER]),
+        (0, 2, {"references": "off"}, []),
+        (0, 2, {"systematics": "off"}, []),
+        (1, 1, {"references": "pattern"}, [TEACHING]),
+    ],
+)
+def test_a_plan_has_what_reference_frames_are_used_for(near, far, options, planned):
+    references = (*(reference(k) for k in range(near)), *(later(k) for k in range(far)))
+    sequence = dr.Sequence("HD 1", science(), references)
+    steps = describe_steps(sequence, ReduceOptions(size=SIZE, **options)).splitlines()
+    names = [each.partition(". ")[2] for each in steps]
+    assert [name for name in names if name in (TEACHING, TOGETHER)] == planned
+
+
+FLAT_FIELD = "jwst_nircam_flat_0001.fits"
+
+
+def later(k, days=55, flat=FLAT_FIELD, **changes):
+    """A frame of a reference star of another epoch, with another wavefront."""
+    frame = reference(k, drift=3e-9, date=Time("2022-10-03T06:00") + days * u.day, **changes)
+    header = fits.Header({**frame.header, "R_FLAT": f"crds://{flat}"})
+    return replace(frame, header=header, name=f"{frame.target} {k}, day {days}")
+
+
+@cache
+def taught():
+    """The pattern of two epochs of a reference star, and the target's fit with it."""
+    first = science()[0]
+    rolls = [replace(first, header=fits.Header({**first.header, "R_FLAT": FLAT_FIELD}))]
+    rolls.append(science()[1])
+    frames = (later(0), later(1), later(2, 300), later(3, flat="other.fits"))
+    maps = []
+
+    def map_for(date):
+        maps.append(date.isot[:10])
+        return OPD
+
+    few = replace(SETTINGS, max_iterations=4)
+    choice = choose_systematics(
+        rolls, frames, model(), OPD, settings=few, map_for=map_for, library=False
+    )
+    assert maps == ["2022-11-27", "2023-07-30"]
+    return choice
+
+
+def test_a_pattern_is_learned_from_stars_of_any_epoch_with_the_same_flat_field():
+    choice = taught()
+    assert choice.origin == "references"
+    assert [len(fit.frames) for fit in choice.references] == [2, 1]
+    ((star, reason),) = choice.failed
+    assert star == "HD 2"
+    assert "flat field other.fits (R_FLAT), the target with jwst_nircam_flat_0001" in reason
+    names = ["HD 2 0, day 55", "HD 2 1, day 55", "HD 2 2, day 300"]
+    assert choice.systematics.provenance["frames"] == names
+    # It is the flat field of the pixels: after a few steps, three frames show more than half of it.
+    true = FLAT * np.random.default_rng(5).normal(size=(SIZE, SIZE))
+    assert np.corrcoef(choice.systematics.pattern.flat, true.flat)[0, 1] > 0.6
+    # A library's pattern is averaged with it if it is an error of the same flat field.
+    first, measured = choice.science[0], measure_patterns(choice.references)
+    for flat, stars in ((FLAT_FIELD, ["HD 2", "HD 9"]), ("other.fits", ["HD 2"])):
+        others = [replace(p, star="HD 9", catalogue=CatalogueStar(), flat=flat) for p in measured]
+        library = PatternLibrary(tuple(others))
+        both = known_systematics(first, choice.references, library=library)
+        assert both.provenance["stars"] == stars
+    # That of frames in the likelihood is not counted twice; that of other epochs is known beside.
+    near, fitted = [reference(0)], [f.observation for fit in choice.references for f in fit.frames]
+    assert is_known_beside(choice, near)
+    assert not is_known_beside(choice, fitted)
+    frames = pattern_for_visit(choice, science(), near).provenance["frames"]
+    assert frames == names
+    assert "frames" not in pattern_for_visit(choice, science(), fitted).provenance
+
+
+def reduced(frames, **options):
+    """The run of a reduction beside frames of reference stars, and its result."""
+    options = ReduceOptions(settings=SETTINGS, size=SIZE, **options)
+    sequence = dr.Sequence("HD 1", science(), tuple(frames))
+    run = pipeline._Run(pipeline.prepare(sequence, OPD, options, model=model()), False)
+    return run, run.result()
+
+
+@pytest.mark.slow
+def test_references_of_other_epochs_teach_the_pattern_and_not_the_wavefront():
+    far = [later(k, flat=FLAT_FIELD) for k in range(3)]
+    near = reference(4)
+    run, result = reduced([near, *far])
+    assert [each.name for each in run._joining] == [near.name]
+    assert [each.use for each in result.visit.contributions] == ["not used", *["pattern"] * 3]
+    assert "only 1 frame of its star" in result.visit.contributions[0].reason
+    assert "of another epoch" in result.visit.contributions[1].reason
+    assert [each.observation.name for each in result.fit.frames] == [e.name for e in science()]
+    assert result.reference_frames == 3
+    assert "3 for the flat-field pattern, 1 not used by the fit: only 1 frame" in str(result)
+    candidate_of(result.detection)
+    # With a pattern of which only the size is known it is 1.4, although that is fitted.
+    assert result.fit.chi2_per_pixel < 1.2 < alone()[1].chi2_per_pixel
+    assert result.fit.status is dr.Status.CONVERGED
+    # KLIP has all of them.
+    assert (
+        "4 reference frames"
+        in klip_curve(result.detection, result.sequence.references).meta["label"]
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "count", "reason"),
+    [
+        ({"references": "off"}, 2, "the option references is 'off'"),
+        ({"systematics": "off"}, 2, "another one, and systematics is 'off'"),
+        ({}, 1, "another one, and there are too few frames for a pattern, two at least"),
+    ],
+)
+def test_what_is_not_used_is_said_with_the_reason(options, count, reason, caplog):
+    _, result = reduced([later(k) for k in range(count)], **options)
+    assert {each.use for each in result.visit.contributions} == {"not used"}
+    for text in (result.visit.in_words(), repr(result.visit), str(result), caplog.text):
+        assert f"of {count} reference frame" in text
+        assert reason in text
+    assert result.reference_frames == 0
+    for klip, use in ((None, "not used"), (result.detection.contrast_curve, "KLIP only")):
+        summary = summarise(result, klip)
+        assert [each["use"] for each in summary["frames"]] == ["target"] * 2 + [use] * count
+        (page,) = {each["use"] for each in summary["visit"]["contributions"]}
+        assert page == use
 
 
 def test_frames_of_several_flat_fields_do_not_share_a_pattern():

@@ -1,7 +1,12 @@
 """Search of whole frames, and extended light that is fitted together with the star."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,14 +20,22 @@ from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import disk as module
-from pyklip_diffrender.detection import sources_at_edges, wide_field, without_blurred_edges
+from pyklip_diffrender.detection import (
+    sources_at_edges,
+    sources_beyond,
+    wide_field,
+    without_blurred_edges,
+)
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.optics.grid import resample
+from pyklip_diffrender.pyklip_backend.fitted_star import FittedPointing
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.reduction.pipeline import _Run, prepare
 from pyklip_diffrender.scene import Sequence
 from pyklip_diffrender.scene.observation import Window
+from pyklip_diffrender.scene.simulation import field_of, images_of_stars, within_field
 from pyklip_diffrender.wavefront import random_drift
 
 
@@ -115,6 +128,123 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit(
     assert known.contrast == pytest.approx(contrast, rel=0.1)
     assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05
     assert run.result().fit.companions[0, 0] == pytest.approx(contrast, rel=0.01)
+
+
+def test_a_frame_in_which_the_image_of_the_pupil_samples_repeats_is_rendered_with_more():
+    """That of 64 samples does after 9.0 arcsec, and the frame has 9.7."""
+    whole, source, opd = 156, dr.Planet.from_offset(1e-2, -2.2, 2.1), dr.random_opd(1, npix=128)
+    frame = dr.simulate(model(whole), dr.Scene(STAR, planets=(source,)), opd, seed=5)
+    settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False, max_iterations=3)
+    coarse, cut = model(32).with_fidelity(npix=64), frame.cutout(32)
+    (fit,) = dr.refine(coarse, cut, opd, settings=settings).frames
+    (known,), _ = sources_beyond([fit], [frame], [cut])
+    assert known.contrast == pytest.approx(source.contrast, rel=0.1)
+    assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05
+    star = fit.render(whole, background=False)
+    with torch.no_grad():
+        # Of the wavefront the fit knows what its samples show.
+        known_opd = resample(resample(opd.data, 64), 128)
+        expected = fit.flux * model(whole)(known_opd).numpy()
+    # The fit has moved the star and the stop a little.
+    assert np.linalg.norm(star - expected) < 0.1 * np.linalg.norm(expected)
+    np.testing.assert_array_equal(fit.render(32, background=False), fit.render(background=False))
+    absorbing = replace(fit, opd=fit.opd * (1 + 0.5j))
+    for samples in (64, 128):
+        rendered = absorbing.opd_for(coarse.with_fidelity(npix=samples))
+        assert rendered.shape == (samples, samples)
+        torch.testing.assert_close(rendered.imag, 0.5 * rendered.real)
+
+
+def real_frame(shape, filter="F444W", mask="MASKA335R", center=None):
+    """A frame of NIRCam with noise only."""
+    header = astropy_fits.Header({"INSTRUME": "NIRCAM", "CORONMSK": mask, "PUPIL": "MASKRND"})
+    ones = np.ones((1, *shape))
+    noise = np.random.default_rng(1).normal(size=ones.shape)
+    scale = 0.031 if filter == "F210M" else 0.063
+    return dr.Observation.from_arrays(
+        noise, ones, pixelscale=scale, filter=filter, header=header, center=center, unit="MJy/sr"
+    )
+
+
+@pytest.mark.parametrize("accuracy", ["full", "quick"])
+def test_of_the_whole_detector_the_field_of_the_mask_is_used(accuracy, caplog):
+    frame = real_frame((2048, 2048), center=[641.3, 1675.4])
+    sequence = Sequence("HD 1", (frame,), (replace(frame, reference=True),))
+    options = ReduceOptions(accuracy=accuracy, wide=True, size=24)
+    caplog.set_level("INFO")
+    prepared = prepare(sequence, dr.random_opd(1, npix=128), options)
+    # As for SUB320 (20.16 arcsec); for all of the detector it would be 2,048.
+    assert prepared.model.npix == {"full": 256, "quick": 128}[accuracy]
+    (whole,), (reference,) = prepared.whole.science, prepared.whole.references
+    assert whole.shape == reference.shape == (320, 320)
+    assert whole.center[0] == pytest.approx([160, 160], abs=1)
+    row, column = np.round(frame.center[0] - whole.center[0]).astype(int)[::-1]
+    np.testing.assert_array_equal(
+        whole.data[0], frame.data[0, row : row + 320, column : column + 320]
+    )
+    assert "2048 x 2048 pixels: of each, the 320 x 320 about the star are used" in caplog.text
+    # pyKLIP's products of such frames have the star there, too.
+    result, pointing = SimpleNamespace(model=prepared.model), SimpleNamespace(observation=frame)
+    fitted = FittedPointing(result, 0, pointing, Window(1663, 629, (24, 24)), np.zeros(2))
+    assert fitted.box == Window(row, column, (320, 320))
+    # At the edge of the detector, the field is as large as inside; a subarray is the field.
+    assert field_of(real_frame((600, 400), center=[390.0, 5.0])) == Window(0, 80, (320, 320))
+    for each in (real_frame((320, 300)), replace(frame, header=astropy_fits.Header())):
+        assert within_field(each) is each
+
+
+@pytest.mark.parametrize("filter", ["F210M", "F444W"])
+def test_a_first_look_behind_a_bar_has_samples_for_all_of_it(filter):
+    """In F210M the image of 128 samples repeats after 8 arcsec, and the bar is longer."""
+    frame = real_frame((80, 80), filter, "MASKASWB")
+    prepared = prepare(Sequence("HD 1", (frame,)), "flat", ReduceOptions(accuracy="quick", size=56))
+    assert prepared.model.npix == {"F210M": 256, "F444W": 128}[filter]
+    star, source = images_of_stars(frame, 0.4, 0.6)
+    assert source.sum() > 2 * star.sum()
+
+
+@pytest.mark.slow
+def test_a_frame_of_the_whole_detector_takes_less_than_two_gigabytes(tmp_path):
+    """In a process of its own, whose peak the operating system knows; 1.4 GB for two full rolls."""
+    script = tmp_path / "whole_detector.py"
+    script.write_text(WHOLE_DETECTOR)
+    root = Path(__file__).parents[1]
+    environment = {**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{root / 'tests'}"}
+    run = subprocess.run(
+        [sys.executable, script], env=environment, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    *found, peak = map(float, run.stdout.split())
+    assert found == pytest.approx([1e-4, -4.2, 5.1], rel=0.1)
+    # Linux counts in kB, macOS in bytes.
+    assert peak / (1e9 if sys.platform == "darwin" else 1e6) < 2
+
+
+WHOLE_DETECTOR = """
+import resource
+
+import numpy as np
+
+import pyklip_diffrender as dr
+from test_wide_field import STAR, real_frame
+
+star = dr.nircam_coronagraph("F444W", npix=256, nlambda=3, fov_pixels=320)
+planet = dr.Planet.from_offset(1e-4, -4.2, 5.1)
+opd = dr.random_opd(1, npix=256)
+sky = dr.simulate(star, dr.Scene(STAR, planets=(planet,)), opd, seed=5)
+frame = real_frame((2048, 2048), center=[641.5, 1675.5])
+frame.data[0] *= 30
+frame.error[0] *= 30
+frame.data[0, 1516:1836, 482:802] = sky.data[0]
+frame.error[0, 1516:1836, 482:802] = sky.error[0]
+# Where the star of another mask would be.
+frame.data[0, 1660:1680, 1200:1220] = 1e6
+settings = dr.GaussNewton.nircam("F444W", cycles=(6.0,), max_iterations=4)
+result = dr.reduce(dr.Sequence("HD 1", (frame,)), opd, settings=settings, wide=True, size=40)
+row = result.wide.candidates[0]
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(row["contrast"], row["x"].value, row["y"].value, peak)
+"""
 
 
 def test_a_faint_source_at_the_edges_of_the_fitted_pixels_is_fitted_with_the_star():

@@ -39,6 +39,8 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
+from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
+from pyklip_diffrender.reduction.visit import worth_joining
 from pyklip_diffrender.scene.sequence import SHORT, Sequence
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
@@ -195,15 +197,20 @@ def describe_steps(sequence: Sequence, options: ReduceOptions) -> str:
     searched = systematics == "auto" or isinstance(systematics, PatternLibrary)
     libraries = [systematics] if isinstance(systematics, PatternLibrary) else []
     library = combine_libraries([*libraries, package_library()])
-    stars = dict.fromkeys(each.target for each in sequence.references)
+    known = searched and known_systematics(sequence.science[0], library=library) is not None
+    teaching, joining = (
+        frames(sequence, options) for frames in (frames_for_pattern, frames_in_likelihood)
+    )
     steps = []
-    if searched and known_systematics(sequence.science[0], library=library) is not None:
+    if known:
         unplaced = [each.name for each in sequence.science if each.first_pixel is None]
         steps += [f"place of {name} on the detector" for name in unplaced]
-    elif systematics == "references" or (searched and options.references == "pattern"):
+    elif searched or systematics == "references":
+        stars = dict.fromkeys(each.target for each in teaching)
         steps += [f"reference star {star}" for star in stars]
     steps.append("wavefront")
-    if stars and options.references == "joint" and not options.disk:
+    is_known = known or (searched and bool(teaching))
+    if worth_joining(joining) if is_known else joining:
         steps.append("reference stars and target together")
     steps.append("search")
     if options.disk:

@@ -179,7 +179,7 @@ class WholeFrame:
         values["star_offset"] = far
         values["detector_shift"] = torch.from_numpy(np.array([x, y]) * scale) - far
         with torch.no_grad():
-            image = model(torch.from_numpy(np.ascontiguousarray(self.fit.opd)), **values)
+            image = model(self.fit.opd_for(model), **values)
         return np.asarray(self.fit.flux * image.double().cpu().numpy())
 
     @cached_property

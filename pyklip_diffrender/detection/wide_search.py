@@ -43,6 +43,7 @@ from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.refinement import star_flux_error
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
+from pyklip_diffrender.scene.simulation import within_field
 
 if TYPE_CHECKING:
     pass
@@ -144,7 +145,7 @@ class WideField:
             None if there is too little of that light to be seen.
         """
         cleaned, seen = [], 0.0
-        for light, frame, part in zip(self.light, whole, cut, strict=True):
+        for light, frame, part in zip(self.light, map(within_field, whole), cut, strict=True):
             column, row = np.rint(frame.center[0] - part.center[0]).astype(int)
             ny, nx = part.shape
             inside = light[row : row + ny, column : column + nx]
@@ -329,7 +330,7 @@ class _Source:
 def wide_field(
     detection: Detection, observations: Sequence[Observation], *, threshold: float | None = None
 ) -> WideField:
-    """Search whole frames for point sources.
+    """Search whole frames for point sources, at most in the field of the mask, 20 arcsec wide.
 
     Parameters
     ----------
@@ -442,7 +443,7 @@ def _frames(detection: Detection, observations: Sequence[Observation]) -> list[W
     known = detection.sources
     inside = np.column_stack([known.contrasts.numpy(), known.offsets.numpy()])
     return [
-        WholeFrame(fit, each, each.roll_from(observations[0]), inside)
+        WholeFrame(fit, within_field(each), each.roll_from(observations[0]), inside)
         for fit, each in zip(fitted, observations, strict=True)
     ]
 

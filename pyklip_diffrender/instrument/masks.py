@@ -18,6 +18,7 @@ from pyklip_diffrender.io.files import embedded_table
 from pyklip_diffrender.optics.grid import STAR_RADIUS
 
 __all__ = [
+    "FIELD",
     "FILTERS",
     "MASKS",
     "BarMask",
@@ -150,6 +151,12 @@ MASKS: dict[str, RoundMask | BarMask] = {
     )
 }
 """The masks of `nircam_coronagraph` by name."""
+
+
+FIELD = 20.2
+"""Side of the square about a mask in which sources are seen past it, arcsec. It is 20 arcsec wide
+(JWST user documentation, "NIRCam Coronagraphic Occulting Masks and Lyot Stops") and the subarrays
+SUB320 and SUB640 hold it; a frame of the whole detector shows other masks beyond."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.fast_path import PlaneWaves
-from pyklip_diffrender.optics.grid import STAR_RADIUS, PupilGrid, samples_for_field, zernike_basis
+from pyklip_diffrender.optics.grid import STAR_RADIUS, PupilGrid, doubled_samples, zernike_basis
 from pyklip_diffrender.optics.planes import CompactOcculter, Wavefront
 from pyklip_diffrender.optics.system import OpticalSystem, Propagation, batch_of
 from pyklip_diffrender.parameters import parameter
@@ -326,8 +326,7 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
     masks = [plane.radius for plane in model.planes if isinstance(plane, CompactOcculter)]
     reach = _bar_reach(model) or max(masks, default=0.0)
     period = max(_field(model), reach + STAR_RADIUS)
-    while npix < samples_for_field(period, min(model.bandpass.wavelengths), model.diameter):
-        npix *= 2
+    npix = doubled_samples(npix, period, min(model.bandpass.wavelengths), model.diameter)
     if "npix" not in model.adjustable or model.npix <= npix or model.npix % npix:
         return model.npix
     return npix

@@ -22,6 +22,7 @@ __all__ = [
     "JWST_DIAMETER",
     "STAR_RADIUS",
     "PupilGrid",
+    "doubled_samples",
     "noll_indices",
     "polygon_coverage",
     "resample",
@@ -124,6 +125,16 @@ def samples_for_field(field: float, wavelength: float, diameter: float = JWST_DI
     `wavelength` (m) is the shortest one, `diameter` (m) the side of the pupil array.
     """
     return math.ceil(field * ARCSEC * diameter / wavelength)
+
+
+def doubled_samples(
+    npix: int, field: float, wavelength: float, diameter: float = JWST_DIAMETER
+) -> int:
+    """Pupil samples `npix`, doubled until there are enough for `field`, see `samples_for_field`."""
+    needed = samples_for_field(field, wavelength, diameter)
+    while npix < needed:
+        npix *= 2
+    return npix
 
 
 def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:

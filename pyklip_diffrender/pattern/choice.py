@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from astropy import units as u
+from astropy.time import Time
 from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift
 
@@ -29,6 +30,7 @@ from pyklip_diffrender.pattern.measure import flat_of, lacks_pattern, measure_pa
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
+from pyklip_diffrender.scene.admission import epochs_of
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.jwst_files import shift_frames, shift_variances
 from pyklip_diffrender.scene.observation import Observation
@@ -294,12 +296,14 @@ def choose_systematics(
     settings: GaussNewton | None = None,
     memory: float | None = None,
     progress: bool = False,
+    map_for: Callable[[Time | None], OPDMap] | None = None,
 ) -> PatternChoice:
     """Choose the flat-field pattern for `science`, the frames of a target as they will be fitted.
 
     "auto", or a `PatternLibrary` to search besides the package's, fits `references`, frames of
     other stars or a function that returns them, only where no library has a pattern; "references"
-    fits them in any case and uses both. `library` is False for frames that do not show its pattern.
+    fits them in any case and uses both. Their fits start from `map_for` their date, by default from
+    `opd`. `library` is False for frames that do not show its pattern.
     Raises DiffrenderError if frames that have to be moved cannot be fitted; a reference star that
     cannot be is left out.
     """
@@ -335,7 +339,9 @@ def choose_systematics(
                 origin = "library"
         if pattern is None and references:
             frames = references() if callable(references) else references
-            fits, failed = _fit_references(frames, model, opd, common)
+            frames, failed = _with_the_flat_of(first, frames)
+            fits, unfitted = _fit_references(frames, model, map_for or (lambda _: opd), common)
+            failed += unfitted
             pattern = known_systematics(first, fits, library=known)
             origin = "references"
         if pattern is None:
@@ -364,18 +370,37 @@ def pattern_for_visit(
         given is not None and not any(shows_star(given, each) for each in references)
     ):
         return choice.systematics
-    if choice.origin == "library":
+    if is_known_beside(choice, references):
         own = {each.target for each in references}
         patterns = [
             pattern
             for pattern in choice.library.patterns
             if not any(same_name(pattern.star, star) for star in own)
         ]
-        known = known_systematics(science[0], library=PatternLibrary(tuple(patterns)))
+        known = known_systematics(
+            science[0], _fits_beside(choice, references), library=PatternLibrary(tuple(patterns))
+        )
         if known is not None:
             return known
     first = science[0]
     return _unknown_pattern([*science, *(each for each in references if _alike(each, first))])
+
+
+def is_known_beside(choice: PatternChoice, references: Sequence[Observation]) -> bool:
+    """Whether the pattern of a choice is that of other frames than these of reference stars."""
+    return choice.origin == "library" or bool(_fits_beside(choice, references))
+
+
+def _fits_beside(choice: PatternChoice, references: Sequence[Observation]) -> list[Refinement]:
+    """Fits of reference stars that taught a pattern, of other frames than these."""
+    if choice.origin != "references":
+        return []
+    names = {each.name for each in references}
+    return [
+        fit
+        for fit in choice.references
+        if not any(frame.observation.name in names for frame in fit.frames)
+    ]
 
 
 def with_known_pattern(settings: GaussNewton) -> GaussNewton:
@@ -425,6 +450,21 @@ def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
     )
 
 
+def _with_the_flat_of(
+    first: Observation, references: Sequence[Observation]
+) -> tuple[list[Observation], list[tuple[str, str]]]:
+    """Frames that show the pattern of a frame; also the stars of the others, and why."""
+    own, kept, failed = flat_of(first), list[Observation](), list[tuple[str, str]]()
+    for each in references:
+        flat = flat_of(each)
+        if None in (own, flat) or flat == own:
+            kept.append(each)
+        else:
+            reason = f"calibrated with the flat field {flat} (R_FLAT), the target with {own}"
+            failed.append((each.target, reason))
+    return kept, list(dict.fromkeys(failed))
+
+
 def _alike(one: Observation, other: Observation) -> bool:
     """Whether two frames have the same pixels and the same error of the flat field."""
     return (one.first_pixel, one.shape, flat_of(one)) == (
@@ -437,18 +477,22 @@ def _alike(one: Observation, other: Observation) -> bool:
 def _fit_references(
     references: Sequence[Observation],
     model: OpticalSystem,
-    opd: OPDMap,
+    map_for: Callable[[Time | None], OPDMap],
     common: dict[str, Any],
 ) -> tuple[list[Refinement], list[tuple[str, str]]]:
-    """Fit every reference star; also the names of those that fail, and why."""
+    """Fit every reference star at each epoch; also the names of those that fail, and why."""
     fits, failed = [], []
     for star, frames in _by_star(references).items():
-        try:
-            with stage(f"reference star {star}"):
-                fits.append(refine(model, frames, opd, **common))
-        except DiffrenderError as error:
-            _log.warning("reference star %s is left out: %s", star, error)
-            failed.append((star, str(error)))
+        epochs = epochs_of([each.date for each in frames])
+        for chosen in ([frames[k] for k in epoch] for epoch in epochs):
+            date = chosen[-1].date
+            day = "" if date is None or len(epochs) == 1 else f" of {date.isot[:10]}"
+            try:
+                with stage(f"reference star {star}{day}"):
+                    fits.append(refine(model, chosen, map_for(date), **common))
+            except DiffrenderError as error:
+                _log.warning("reference star %s%s is left out: %s", star, day, error)
+                failed.append((star, str(error)))
     return fits, failed
 
 

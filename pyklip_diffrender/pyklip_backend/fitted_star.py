@@ -18,6 +18,7 @@ from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.source_frames import Pointing
 from pyklip_diffrender.scene.jwst_files import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
+from pyklip_diffrender.scene.simulation import field_of
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
@@ -55,10 +56,13 @@ class FittedPointing:
 
     @cached_property
     def box(self) -> Window:
-        """Pixels that can be rendered: all valid ones of the frames, or the fitted square only."""
+        """Pixels that can be rendered: the valid ones in the field of the mask, or those fitted."""
         # The fitted wavefront can be rendered on a larger detector if the model's field can be
         # changed.
-        box = Window.holding(self.pointing.observation.valid)
+        observation = self.pointing.observation
+        field = field_of(observation)
+        inside = np.isfinite(field.paste(np.zeros(field.shape), observation.shape))
+        box = Window.holding(observation.valid & inside)
         adjustable = "fov_pixels" in self.result.model.adjustable
         return box if box not in self.window and adjustable else self.window
 

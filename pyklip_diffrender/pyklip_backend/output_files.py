@@ -456,6 +456,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         "DRKEPT": companions,
         "DRSYST": _shared(r.subtraction.systematics for r in records),
         "DRREFS": sum(r.subtraction.references for r in records),
+        "DRREFUSE": _shared(_use_of_references(r.subtraction) for r in records),
         "DRPIXELS": _shared(r.frames.pixels for r in records),
         "DRFILLED": sum(r.filled for r in records),
         "DRIMAGE": _shared(r.image for r in records),
@@ -491,6 +492,11 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         for line in _fitted(subtraction):
             header.add_history(f"diffrender: {line}")
     return header
+
+
+def _use_of_references(subtraction: Subtraction) -> str:
+    """What the frames of reference stars were used for; empty for other subtractors."""
+    return "" if subtraction.reduction is None else subtraction.reduction.visit.in_words()
 
 
 def _fitted(subtraction: Subtraction) -> Iterator[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.progress import heard_by
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
@@ -81,13 +82,23 @@ def subtract_by_refinement(
     tell(f"{_described(fit)}, {fit.seconds:.0f} s, flat-field pattern: {reduction.pattern}")
     tell(f"{counted(number, 'companion')} detected")
     warn_of_status(science[0].name, fit)
-    windows, _ = sequence.windows(model.detector.shape)
+    if references and not reduction.reference_frames:
+        warnings.warn(
+            f"{science[0].name}: the mode has RDI, but no frame of the library is used: "
+            f"{reduction.visit.in_words()}",
+            DiffrenderWarning,
+            stacklevel=2,
+        )
     cut = preparation.sequence.science
     fitted = tuple(
         FittedPointing(
-            fit, k, group, window, fit.frames[k].observation.center[0] - cut[k].center[0]
+            fit,
+            k,
+            group,
+            _window(group.observation, each),
+            fit.frames[k].observation.center[0] - each.center[0],
         )
-        for k, (group, window) in enumerate(zip(groups, windows, strict=True))
+        for k, (group, each) in enumerate(zip(groups, cut, strict=True))
     )
     star = np.full(observation.data.shape, np.nan)
     for part in fitted:
@@ -106,6 +117,12 @@ def subtract_by_refinement(
         reduction,
         number if kept else len(fit.companions),
     )
+
+
+def _window(whole: Observation, cut: Observation) -> Window:
+    """The pixels of a frame that a cutout of it has."""
+    x, y = np.rint(whole.center[0] - cut.center[0]).astype(int).tolist()
+    return Window(y, x, cut.shape)
 
 
 def _give_back(

@@ -535,15 +535,17 @@ def _wide(wide: WideField) -> list[Picture]:
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {wide.threshold:g}"
     oriented = wide.observation.position_angles is not None
     up = "north up" if oriented else "oriented like the first frame"
+    ny, nx = wide.snr.shape
     return _pictures(
         figures,
         ["whole_frames_snr", "whole_frames_contrast_curve"],
         (
             f"Map of the signal-to-noise ratio of a point source in the whole frames, {some}.",
-            f"S/N of a point source in the whole frames, {up}. Circles have the numbers of the "
-            "table. About the star it is that of the search above; elsewhere the star, "
-            "extrapolated from its fit, and the background were subtracted. Errors follow the "
-            "scatter of the S/N at every separation.",
+            f"S/N of a point source in the whole frames, {up}: {nx} × {ny} pixels, at most the "
+            "field of the mask, 20 arcsec wide. Circles have the numbers of the table. About the "
+            "star it is that of the search above; elsewhere the star, extrapolated from its fit, "
+            "and the background were subtracted. Errors follow the scatter of the S/N at every "
+            "separation.",
         ),
         (
             "Curve of the contrast limit against separation in arcsec, to the edge of the frames.",

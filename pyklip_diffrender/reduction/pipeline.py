@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from astropy.table import QTable
+from astropy.time import Time
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -44,8 +47,15 @@ from pyklip_diffrender.pattern import (
     PatternChoice,
     PatternLibrary,
     fit_with_pattern,
+    is_known_beside,
 )
-from pyklip_diffrender.reduction.visit import Joined, Visit, rough_settings, with_references
+from pyklip_diffrender.reduction.visit import (
+    Contribution,
+    Joined,
+    Visit,
+    rough_settings,
+    with_references,
+)
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
@@ -61,8 +71,8 @@ from pyklip_diffrender.refinement import (
 )
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.scene.simulation import model_for
+from pyklip_diffrender.scene.sequence import OF_ANOTHER_EPOCH, Sequence
+from pyklip_diffrender.scene.simulation import model_for, within_field
 from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
 from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
@@ -71,6 +81,8 @@ __all__ = [
     "Keeper",
     "Preparation",
     "ReductionResult",
+    "frames_for_pattern",
+    "frames_in_likelihood",
     "looks_extended",
     "on_extended_light",
     "prepare",
@@ -231,10 +243,9 @@ class ReductionResult:
 
     @property
     def reference_frames(self) -> int:
-        """Number of frames of reference stars that the flat-field pattern was learned from."""
-        if self.systematics is None:
-            return 0
-        return sum(frame.observation.count for fit in self.references for frame in fit.frames)
+        """Number of integrations of reference stars that wavefront or pattern were fitted to."""
+        used = {each.name for each in self.visit.contributions if each.use != "not used"}
+        return sum(each.count for each in self.sequence.references if each.name in used)
 
     @property
     def remark(self) -> str:
@@ -285,12 +296,7 @@ class ReductionResult:
     @property
     def _references(self) -> str:
         """Use of the frames of reference stars, in a line; empty without any."""
-        every = self.visit.contributions
-        used = sum(each.use == "joint" for each in every)
-        if not every:
-            return ""
-        deeper = f"; limits {self.visit.gain:.2f} times deeper" if used else ""
-        return f"reference frames in the likelihood: {used} of {len(every)}{deeper}\n"
+        return f"{self.visit.in_words()}\n" if self.visit.contributions else ""
 
     def _repr_html_(self) -> str:
         facts = {
@@ -332,6 +338,12 @@ def prepare(
     beyond the edges of the frames are masked. Raises as `reduce`.
     """
     wavefront = wavefront_for(opd, sequence.date)
+    is_folder = isinstance(opd, str | os.PathLike) and Path(opd).is_dir()
+
+    def map_for(date: Time | None) -> OPDMap:
+        """Of a folder of maps, the one nearest to a date."""
+        return wavefront_for(opd, date) if is_folder and date is not None else wavefront
+
     if options.star_flux is not None:
         for each in sequence.science:
             require_calibrated(each)
@@ -340,12 +352,13 @@ def prepare(
             "without a wavefront map the star's flux, and contrasts with it, may be wrong by 40 %; "
             "give the flux with the option star_flux"
         )
+    sequence = _within_field(sequence)
     if options.wide:
         require_outer_pixels(sequence.science[0], options.side)
     first, settings, coarser = sequence.science[0], options.settings, {}
     if options.accuracy == "quick":
         settings = quick_settings(first.cutout(options.side))
-        coarser = coarse_arguments(first, max(first.shape) if options.wide else options.side)
+        coarser = coarse_arguments(first, (options.side, options.side))
     if model is None:
         model = model_for(first, options.side, device=options.device, **coarser)
         cut = sequence.cutout(options.side)
@@ -371,7 +384,37 @@ def prepare(
             "systematics: none of the %d patterns that were given is of other stars, these pixels, "
             "detector, mask and filter", len(given.patterns)
         )  # fmt: skip
-    return Preparation(sequence, cut, model, wavefront, options, settings)
+    return Preparation(sequence, cut, model, wavefront, options, settings, map_for)
+
+
+def _within_field(sequence: Sequence) -> Sequence:
+    """The frames without the pixels beyond the field of their mask, as those of a subarray are."""
+    largest = sequence.science[0].shape
+    science, references = (
+        tuple(map(within_field, frames)) for frames in (sequence.science, sequence.references)
+    )
+    if science[0].shape != largest:
+        _log.info(
+            "frames of %d x %d pixels: of each, the %d x %d about the star are used, the field of "
+            "its mask", *largest[::-1], *science[0].shape[::-1]
+        )  # fmt: skip
+    return replace(sequence, science=science, references=references)
+
+
+def frames_in_likelihood(sequence: Sequence, options: ReduceOptions) -> tuple[Observation, ...]:
+    """Frames of reference stars that may be fitted together with the target's."""
+    # The light of a disk would have to be told from the wavefront of other stars first.
+    joins = options.references == "joint" and not options.disk
+    return sequence.same_epoch if joins else ()
+
+
+def frames_for_pattern(sequence: Sequence, options: ReduceOptions) -> tuple[Observation, ...]:
+    """Frames of reference stars that are fitted for the pattern, where no library has it."""
+    if options.systematics == "references" or options.references == "pattern":
+        return sequence.references
+    if options.references == "off":
+        return ()
+    return sequence.references if options.disk else sequence.other_epochs
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,6 +430,8 @@ class Preparation:
     options: ReduceOptions
     # Of the fits; None for those of `refine`.
     settings: GaussNewton | None = None
+    # The wavefront to start from at another date; None for the same at all.
+    map_for: Callable[[Time | None], OPDMap] | None = None
 
     def run(self, *, progress: bool = False, products: Keeper | None = None) -> ReductionResult:
         """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
@@ -408,11 +453,9 @@ class _Run:
     def result(self) -> ReductionResult:
         options, whole = self.preparation.options, self.preparation.whole.science
         self._require_possible_flux()
-        for_pattern = options.references == "pattern" or options.systematics == "references"
-        for_pattern = for_pattern or (options.disk and options.references == "joint")
         choice, fit = fit_with_pattern(
             self.preparation.sequence.science,
-            self.preparation.sequence.references if for_pattern else (),
+            self._teaching,
             self.preparation.model,
             self.preparation.wavefront,
             self._first_fit,
@@ -420,8 +463,10 @@ class _Run:
             settings=self.preparation.settings,
             memory=options.memory,
             progress=self.progress,
+            map_for=self.preparation.map_for,
         )
         fit, visit, detection = self._with_references(fit, choice)
+        self._say_what_is_unused(visit)
         disk: Disk | None = None
         wide: WideField | None = None
         injections: QTable | None = None
@@ -587,17 +632,17 @@ class _Run:
 
     @property
     def _joining(self) -> tuple[Observation, ...]:
-        """Frames of reference stars that are fitted together with the target's."""
-        options = self.preparation.options
-        # The light of a disk would have to be told from the wavefront of other stars first.
-        joins = options.references == "joint" and not options.disk
-        return self.preparation.sequence.references if joins else ()
+        return frames_in_likelihood(self.preparation.sequence, self.preparation.options)
+
+    @property
+    def _teaching(self) -> tuple[Observation, ...]:
+        return frames_for_pattern(self.preparation.sequence, self.preparation.options)
 
     def _joins_early(self, choice: PatternChoice) -> bool:
         """Whether the fit of the target alone is only the beginning of that of all frames."""
-        # Where the library knows the pattern, the target alone may have the deeper limits, so it is
-        # fitted to the end and both fits are searched.
-        return bool(self._joining) and choice.origin != "library"
+        # Where the pattern is known, the target alone may have the deeper limits, so it is fitted
+        # to the end and both fits are searched.
+        return bool(self._joining) and not is_known_beside(choice, self._joining)
 
     def _with_references(self, fit: Refinement, choice: PatternChoice) -> Joined:
         """Fit target and reference stars together."""
@@ -621,7 +666,57 @@ class _Run:
                     progress=self.progress,
                 )
             joined = joined._replace(fit=whole)
-        return joined
+        return joined._replace(visit=self._with_all_references(joined, choice))
+
+    def _with_all_references(self, joined: Joined, choice: PatternChoice) -> Visit:
+        """The use of every frame of a reference star, in the joint fit or not."""
+        systematics = joined.fit.systematics
+        taught = set() if systematics is None else set(systematics.provenance.get("frames", ()))
+        fitted = {f.observation.name for fit in choice.references for f in fit.frames} & taught
+        known = {each.name: each for each in joined.visit.contributions}
+        contributions = []
+        for each in self.preparation.sequence.references:
+            own = known.get(each.name) or Contribution(each.name, each.target, "not used")
+            if own.use == "not used" and each.name in fitted:
+                is_far = any(each is one for one in self.preparation.sequence.other_epochs)
+                own = replace(own, use="pattern", reason=OF_ANOTHER_EPOCH if is_far else own.reason)
+            elif not own.reason and own.use == "not used":
+                own = replace(own, reason=self._why_unused(each, joined.fit, choice))
+            contributions.append(own)
+        return replace(joined.visit, contributions=tuple(contributions))
+
+    def _why_unused(self, reference: Observation, fit: Refinement, choice: PatternChoice) -> str:
+        """Why a frame of a reference star that did not join the target taught no pattern either."""
+        if not fit.status.usable:
+            return "the fit of the target failed"
+        failed = dict(choice.failed).get(reference.target)
+        if failed is not None:
+            return failed
+        if not any(each is reference for each in self._teaching):
+            return f"the option references is {self.preparation.options.references!r}"
+        is_near = any(each is reference for each in self.preparation.sequence.same_epoch)
+        where = "" if is_near else f"{OF_ANOTHER_EPOCH}, and "
+        why = {
+            "library": "the library knows the pattern (systematics='references' adds theirs)",
+            "given": "the pattern was given",
+            "off": "systematics is 'off'",
+        }.get(choice.origin, "there are too few frames for a pattern, two at least")
+        return where + why
+
+    def _say_what_is_unused(self, visit: Visit) -> None:
+        """Log the use of reference frames; warn if none of those that were asked for is used."""
+        if not visit.contributions:
+            return
+        (_log.warning if visit.unused else _log.info)("%s", visit.in_words())
+        sequence, options = self.preparation.sequence, self.preparation.options
+        named = any(row.is_named for row in sequence.rows if row.use == "reference")
+        asked = named or options.systematics == "references"
+        if asked and len(visit.unused) == len(visit.contributions):
+            warnings.warn(
+                f"{sequence.target}: no frame of a reference star is used: {visit.in_words()}",
+                DiffrenderWarning,
+                stacklevel=2,
+            )
 
     def _require_plausible(self, fit: Refinement) -> None:
         limit = self.preparation.options.max_chi2

@@ -101,12 +101,10 @@ def _setup(summary: Mapping[str, Any]) -> str:
     """Instrument, filter, mask, dates and frames in a line."""
     dates = [str(summary[key] or "")[:10] for key in ("first_date", "last_date")]
     targets = [each for each in summary["frames"] if each["use"] == "target"]
-    references = len(summary["frames"]) - len(targets)
-    joint = sum(each["use"] == "joint" for each in summary["visit"]["contributions"])
-    used = summary["systematics"]
-    purpose = "KLIP alone" if used is None or not used["own_stars"] else "the pattern and KLIP"
-    if joint:
-        purpose = f"KLIP, {joint} of them in the likelihood"
+    uses = [each["use"] for each in summary["frames"] if each["use"] != "target"]
+    words = {"wavefront": "in the likelihood", "pattern": "for the pattern"}
+    purposes = [f"{uses.count(use)} {what}" for use, what in words.items() if use in uses]
+    purposes += [f"{uses.count(use)} {use}" for use in ("KLIP only", "not used") if use in uses]
     parts = [
         summary["instrument"],
         summary["filter"],
@@ -114,7 +112,7 @@ def _setup(summary: Mapping[str, Any]) -> str:
         summary["program"] and f"program {summary['program']}",
         " to ".join(dict.fromkeys(filter(None, dates))),
         count(len(targets), "frame") + " of the target",
-        f"{count(references, 'frame')} of reference stars, for {purpose}" if references else None,
+        f"{count(len(uses), 'frame')} of reference stars: {', '.join(purposes)}" if uses else None,
         summary["exposure_s"] and f"{summary['exposure_s']:.0f} s on the target",
     ]
     return " · ".join(str(part) for part in parts if part)

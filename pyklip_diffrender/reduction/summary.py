@@ -41,6 +41,11 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
     """
     sequence, detection = reduction.sequence, reduction.detection
     fit = reduction.fit
+    contributions = [asdict(each) for each in reduction.visit.contributions]
+    for each in contributions:
+        if klip is not None and each["use"] == "not used":
+            each["use"] = "KLIP only"
+    uses = {each["name"]: each["use"] for each in contributions}
     first = sequence.science[0]
     dates = [each.date for each in sequence.science if each.date is not None]
     summary = {
@@ -92,12 +97,9 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
                 # Frames of reference stars follow those of the target.
                 for each, fitted in zip(sequence.science, fit.frames, strict=False)
             ),
-            *(_frame(each, "reference") for each in sequence.references),
+            *(_frame(each, uses.get(each.name, "not used")) for each in sequence.references),
         ],
-        "visit": {
-            "gain": reduction.visit.gain,
-            "contributions": [asdict(each) for each in reduction.visit.contributions],
-        },
+        "visit": {"gain": reduction.visit.gain, "contributions": contributions},
         "admission": _rows(sequence.table),
         "left_out": [
             *({"name": name, "reason": reason} for name, reason in sequence.excluded),

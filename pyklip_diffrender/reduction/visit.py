@@ -53,7 +53,13 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["Contribution", "Visit", "rough_settings", "with_references"]
+__all__ = [
+    "Contribution",
+    "Visit",
+    "rough_settings",
+    "with_references",
+    "worth_joining",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -128,7 +134,8 @@ class Contribution:
     # Name of its file.
     name: str
     star: str
-    # "joint": in one likelihood with the target; "pattern": for the pattern only; or "left out".
+    # "wavefront": in one likelihood with the target; "pattern": for the pattern only; or "not used"
+    # by the fit, though by KLIP for comparison.
     use: str
     # Why it was not used, or not all of its pixels; else empty.
     reason: str = ""
@@ -151,12 +158,30 @@ class Visit:
     gain: float = math.nan
 
     def __repr__(self) -> str:
-        used = sum(each.use == "joint" for each in self.contributions)
-        deeper = f", limits {self.gain:.2f} times deeper" if used else ""
-        return (
-            f"<Visit: {used} of {len(self.contributions)} reference frames in the "
-            f"likelihood{deeper}>"
-        )
+        return f"<Visit: {self.in_words()}>"
+
+    @property
+    def unused(self) -> tuple[Contribution, ...]:
+        """Frames that took no part in the fit."""
+        return tuple(each for each in self.contributions if each.use == "not used")
+
+    def in_words(self) -> str:
+        """What the frames were used for in a line, and why some were not."""
+        counts = Counter(each.use for each in self.contributions)
+        total = len(self.contributions)
+        if not total:
+            return "no reference frames"
+        parts = []
+        if counts["wavefront"]:
+            parts.append(
+                f"{counts['wavefront']} in the likelihood, limits {self.gain:.2f} times deeper"
+            )
+        if counts["pattern"]:
+            parts.append(f"{counts['pattern']} for the flat-field pattern")
+        if counts["not used"]:
+            reasons = dict.fromkeys(each.reason for each in self.unused)
+            parts.append(f"{counts['not used']} not used by the fit: {'; '.join(reasons)}")
+        return f"of {total} reference frame{'' if total == 1 else 's'} {', '.join(parts)}"
 
     @property
     def table(self) -> QTable:
@@ -202,7 +227,12 @@ def with_references(
     left_out: dict[str, str] = {}
     used = _that_fit_into(memory, fit, references, left_out)
     if search is not None:
-        used = _worth_while(used, left_out)
+        every, used = used, worth_joining(used)
+        little = [each for each in every if not any(each is one for one in used)]
+        for each in little:
+            count = sum(one.target == each.target for one in little)
+            only = "1 frame" if count == 1 else f"{count} frames"
+            left_out[each.name] = f"only {only} of its star, and the pattern is known"
     pattern = pattern_for_visit(choice, [each.observation for each in fit.frames], used)
     settings = replace(
         fit.settings,
@@ -280,15 +310,10 @@ def _companions(fit: Refinement, alone: Detection | None) -> tuple[Planet, ...]:
     return alone.sources.planets()
 
 
-def _worth_while(references: list[Observation], left_out: dict[str, str]) -> list[Observation]:
-    """Frames of stars that were observed often enough, where the library knows the pattern."""
+def worth_joining(references: Sequence[Observation]) -> list[Observation]:
+    """Frames of stars that were observed often enough, where the pattern is known."""
     counts = Counter(each.target for each in references)
-    for each in references:
-        if counts[each.target] < _DITHERED:
-            left_out[each.name] = (
-                f"{counts[each.target]} frames of its star add little to the library's pattern"
-            )
-    return [each for each in references if each.name not in left_out]
+    return [each for each in references if counts[each.target] >= _DITHERED]
 
 
 def _that_fit_into(
@@ -533,7 +558,7 @@ def _contributions(
             Contribution(
                 each.name,
                 each.target,
-                "joint",
+                "wavefront",
                 remarks.get(each.name, ""),
                 float(values[k]),
                 joint.frames[k].flux / joint.frames[0].flux,
@@ -547,6 +572,6 @@ def _left_out(
     references: Iterable[Observation], reasons: dict[str, str]
 ) -> tuple[Contribution, ...]:
     return tuple(
-        Contribution(each.name, each.target, "left out", reasons.get(each.name, ""))
+        Contribution(each.name, each.target, "not used", reasons.get(each.name, ""))
         for each in references
     )

@@ -28,6 +28,7 @@ from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.optics.grid import doubled_samples, resample
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.refinement.fit_file import (
@@ -259,7 +260,7 @@ class FrameFit:
         if source is not None:
             values["star_offset"] = torch.tensor(source, dtype=torch.float64)
         with torch.no_grad():
-            image = model(torch.from_numpy(self.opd), **values).double().cpu().numpy()
+            image = model(self.opd_for(model), **values).double().cpu().numpy()
         level = float(self.values["background"][0]) if background else 0.0
         return np.asarray(self.flux * image + level)
 
@@ -268,10 +269,18 @@ class FrameFit:
         fov_pixels: int | tuple[int, int] | None = None,
         center: tuple[float, float] | None = None,
     ) -> tuple[OpticalSystem, dict[str, Tensor]]:
-        """Return the model on another array of pixels, and its parameters; see `render`."""
+        """Return the model on another array of pixels, and its parameters; see `render`.
+
+        Where the image of the model's pupil samples would repeat in a larger array, it has more,
+        see `opd_for`.
+        """
         model = self.model
         if fov_pixels is not None and fov_pixels != self.model.detector.shape:
-            model = model.with_fidelity(fov_pixels=fov_pixels, fov_arcsec=None)
+            changes: dict[str, Any] = {"fov_pixels": fov_pixels, "fov_arcsec": None}
+            npix = self._samples_for(fov_pixels)
+            if npix > model.npix and "npix" in model.adjustable:
+                changes["npix"] = npix
+            model = model.with_fidelity(**changes)
         values = self.optical_values
         if center is not None:
             ny, nx = model.detector.shape
@@ -281,6 +290,20 @@ class FrameFit:
             shift = torch.from_numpy(moved * np.array(model.detector.pixelscale))
             values["detector_shift"] = shift + values.get("detector_shift", torch.zeros(2))
         return model, values
+
+    def _samples_for(self, fov_pixels: int | tuple[int, int]) -> int:
+        """Pupil samples for an image of the star on (ny, nx) pixels."""
+        model = self.model
+        ny, nx = (fov_pixels, fov_pixels) if isinstance(fov_pixels, int) else fov_pixels
+        x, y = model.detector.pixelscale
+        shortest = min(model.bandpass.wavelengths)
+        return doubled_samples(model.npix, max(nx * x, ny * y), shortest, model.diameter)
+
+    def opd_for(self, model: OpticalSystem) -> Tensor:
+        """The refined wavefront on the pupil samples of a model of `on_pixels`, m."""
+        parts = (self.opd.real, self.opd.imag) if np.iscomplexobj(self.opd) else (self.opd,)
+        maps = [torch.from_numpy(resample(each, model.npix)) for each in parts]
+        return torch.complex(*maps) if len(maps) > 1 else maps[0]
 
     def to_hdus(self, k: int) -> tuple[dict[str, Any], list[Any]]:
         """Return metadata and FITS extensions of the frame, with EXTVER k + 1."""

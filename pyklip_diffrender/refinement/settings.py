@@ -14,13 +14,13 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import stop_is_measured
-from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.units import ARCSEC, half_circle, require_positive, to_bytes, to_unit
-from pyklip_diffrender.optics.grid import JWST_DIAMETER, samples_for_field
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.exposure import image_mask, module_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.simulation import pupil_samples
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, WavefrontPrior, scale_ratios
 
@@ -494,16 +494,12 @@ def faintness(observation: Observation) -> float:
     return _REFERENCE / max(float(np.median(squares)), 1e-6)
 
 
-def coarse_arguments(observation: Observation, size: int) -> dict[str, Any]:
-    """Arguments of `model_for`, by the noise, for a first look at `size` x `size` pixels."""
+def coarse_arguments(observation: Observation, shape: tuple[int, int]) -> dict[str, Any]:
+    """Arguments of `model_for`, by the noise, for a first look at (ny, nx) pixels."""
     nlambda = 3 if faintness(observation) >= _VERY_FAINT else 7
     if observation.filter is None:
         return {}
-    shortest = float(filter_throughput(observation.filter)[0][0])
-    npix = _COARSE_NPIX
-    while npix < samples_for_field(size * max(observation.pixelscale), shortest):
-        npix *= 2
-    return {"nlambda": nlambda, "npix": npix}
+    return {"nlambda": nlambda, "npix": pupil_samples(observation, shape, _COARSE_NPIX)}
 
 
 def quick_settings(observation: Observation) -> GaussNewton:

@@ -52,6 +52,9 @@ __all__ = ["SHORT", "Epoch", "Row", "Sequence", "epochs_of_files", "judge_frames
 
 # The table of admission: one row for each file, what it is used for, and what it is.
 
+OF_ANOTHER_EPOCH = "of another epoch than the target, whose wavefront is another one"
+"""Why a frame of a reference star takes no part in the fit of the wavefront."""
+
 SHORT = ("use", "star", "date", "position_angle", "integrations", "file")
 """Columns for a screen."""
 
@@ -66,6 +69,7 @@ class Row:
     observation: Observation | None = None  # the frames, unless they are excluded
     remark: str = ""  # why the file is excluded, or what of it was left out
     path: Path | None = None
+    is_named: bool = False  # given as a reference star's, and not found in a folder
 
     @property
     def time(self) -> float:
@@ -166,7 +170,8 @@ class Sequence:
     science : tuple of Observation
         One for each roll or pointing of the target, in order of time.
     references : tuple of Observation
-        Frames of other stars through the same coronagraph, in order of time.
+        Frames of other stars through the same coronagraph, in order of time: those of `same_epoch`
+        and `other_epochs`.
     excluded : tuple of (str, str)
         Names of the files that were left out, and why.
     rows : tuple of Row
@@ -246,7 +251,8 @@ class Sequence:
             Date in the epoch to use, such as "2022-10-03", if the target was observed in several.
             Frames of one epoch are at most 5 days apart, and share a wavefront.
         references : iterable of path
-            Further files, of reference stars even if their headers do not say so.
+            Further files, of reference stars even if their headers do not say so, of any epoch and
+            programme.
         star : tuple of float, optional
             x, y of the target's star in its files, pixels from 0, in place of what the headers
             say. The files are then not judged by whether their light is that of a star there. For
@@ -322,8 +328,9 @@ class Sequence:
     ) -> tuple[Sequence, ...]:
         """Sort files as `from_files` does, into one sequence for each epoch.
 
-        Frames of the target more than 5 days apart belong to different epochs. A reference star
-        belongs to the epochs of the target that it was observed within 5 days of.
+        Frames of the target more than 5 days apart belong to different epochs. Reference stars go
+        with all of them: for the wavefront with those within 5 days, else for the flat-field
+        pattern and KLIP.
 
         Returns
         -------
@@ -414,7 +421,7 @@ class Sequence:
         exposures: dict[str, str] = {}
         for each in listed:
             reason = each.reason
-            if not reason and each not in chosen and (each in science or not _near(each, dates)):
+            if not reason and each in science and each not in chosen:
                 day = min(dates).isot[:10]
                 reason = f"of another epoch than the frames of {day}, which have another wavefront"
             if reason:
@@ -428,8 +435,13 @@ class Sequence:
                 used[use].append(part)
                 # Segments are files of one exposure, which has no number of a segment in its name.
                 exposures[part.name] = re.sub(r"-seg\d+", "", each.exposure.identity or part.name)
-                remark = "; ".join(part.remarks)
-                rows.append(Row(use, each.star, each.exposure, part, remark, each.path))
+                remarks = list(part.remarks)
+                if not _is_near(each.exposure.date, dates):
+                    remarks.append(f"{OF_ANOTHER_EPOCH}: for the flat-field pattern and KLIP only")
+                remark = "; ".join(remarks)
+                rows.append(
+                    Row(use, each.star, each.exposure, part, remark, each.path, each.for_reference)
+                )
         rows.sort(key=lambda row: (("target", "reference", "excluded").index(row.use), row.time))
         return cls(
             star,
@@ -440,10 +452,24 @@ class Sequence:
         )
 
     @property
+    def same_epoch(self) -> tuple[Observation, ...]:
+        """Frames of reference stars that share a wavefront with the target's, as far as known."""
+        return tuple(each for each in self.references if _is_near(each.date, self._dates))
+
+    @property
+    def other_epochs(self) -> tuple[Observation, ...]:
+        """The other frames of reference stars, which have another wavefront."""
+        return tuple(each for each in self.references if not _is_near(each.date, self._dates))
+
+    @property
+    def _dates(self) -> list[Time]:
+        """Known dates of the target's frames."""
+        return [each.date for each in self.science if each.date is not None]
+
+    @property
     def date(self) -> Time | None:
         """Mean date of the target's frames, None if none of them has one."""
-        dates = [each.date for each in self.science if each.date is not None]
-        return Time(dates).mean() if dates else None
+        return Time(self._dates).mean() if self._dates else None
 
     @property
     def table(self) -> QTable:
@@ -622,9 +648,8 @@ def _by_star(listed: Iterable[FrameFile]) -> Iterable[list[FrameFile]]:
     return stars.values()
 
 
-def _near(file: FrameFile, dates: list[Time]) -> bool:
+def _is_near(date: Time | None, dates: list[Time]) -> bool:
     """Whether a frame was taken in the epoch of these dates, as far as is known."""
-    date = file.exposure.date
     return date is None or not dates or min(abs(date.mjd - each.mjd) for each in dates) <= EPOCH
 
 

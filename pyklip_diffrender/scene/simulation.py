@@ -11,26 +11,35 @@ import torch
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.instrument.masks import MASKS, detector_place, stop_is_measured
+from pyklip_diffrender.instrument.masks import (
+    FIELD,
+    MASKS,
+    DetectorPlace,
+    detector_place,
+    stop_is_measured,
+)
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.grid import samples_for_field
+from pyklip_diffrender.optics.grid import doubled_samples
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask, module_of
 from pyklip_diffrender.scene.objects import Planet, Scene
-from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.wavefront.opd import random_opd
 
 __all__ = [
     "expected_photons",
+    "field_of",
     "images_of_stars",
     "model_for",
     "planet_photons",
+    "pupil_samples",
     "require_imaged",
     "simulate",
     "star_photons",
+    "within_field",
 ]
 
 
@@ -109,45 +118,23 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         "pixelscale": observation.pixelscale,
     }
     if observation.is_nircam:
-        mask_name = image_mask(observation.header, observation.name)
-        name = overrides.get("image_mask") or mask_name
-        if name is None:
-            raise IncompatibleSetupError(
-                f"{observation.name}: the header does not say behind which mask the star is. Add "
-                "CORONMSK, such as MASKA335R, or give image_mask"
-            )
-        if name not in MASKS:
-            raise IncompatibleSetupError(
-                f"{observation.name}: these frames have image mask {mask_name}, expected one of "
-                f"{', '.join(MASKS)}"
-            )
-        along = bar_place(observation.header, observation.name)
-        module = module_of(observation.header, observation.name) or "A"
-        place = detector_place(name, observation.filter, along, overrides.get("module", module))
-        detector = detector_of(observation.header, observation.name)
-        if detector not in (None, place.header_detector):
-            raise IncompatibleSetupError(
-                f"{observation.name}: these frames are of the detector {detector}, expected "
-                f"{place.header_detector}, on which {name} is imaged in {observation.filter}"
-            )
-        shortest = float(filter_throughput(observation.filter)[0][0])
-        (ny, nx), (x, y) = observation.shape, place.siaf_pixelscale
-        # Powers of two times the default, until the image of the sampled pupil does not repeat in
-        # the field.
-        npix = _NPIX
-        while npix < samples_for_field(max(nx * x, ny * y, place.period()), shortest):
-            npix *= 2
+        place = _place_of(observation, overrides.get("image_mask"), overrides.get("module"))
+        # The star may be rendered in the whole field of the mask as well.
+        shape = observation.shape
+        if size is not None:
+            ny, nx = field_of(observation).shape
+            shape = max(ny, size), max(nx, size)
         arguments |= {
-            "image_mask": name,
+            "image_mask": place.mask,
             "module": place.module,
             "bar_place": place.place,
             "pixelscale": place.siaf_pixelscale,
             "shear": place.siaf_shear,
             "nlambda": 7,
-            "npix": npix,
+            "npix": pupil_samples(observation, shape, _NPIX, place),
             "occulter_sampling": _CELLS,
             "defaults": FLIGHT_ALIGNMENT
-            if stop_is_measured(name, place.short_wave, place.module)
+            if stop_is_measured(place.mask, place.short_wave, place.module)
             else None,
         }
     arguments |= overrides
@@ -159,6 +146,70 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         return _model(observation.filter, items, tuple((defaults or {}).items()))
 
 
+def _place_of(
+    observation: Observation, mask: str | None = None, module: str | None = None
+) -> DetectorPlace:
+    """Where the star of a frame of NIRCam is, behind the mask of its header or another one.
+
+    IncompatibleSetupError if the header does not say, or what it says is not modelled.
+    """
+    in_header = image_mask(observation.header, observation.name)
+    name = mask or in_header
+    if name is None:
+        raise IncompatibleSetupError(
+            f"{observation.name}: the header does not say behind which mask the star is. Add "
+            "CORONMSK, such as MASKA335R, or give image_mask"
+        )
+    if name not in MASKS:
+        raise IncompatibleSetupError(
+            f"{observation.name}: these frames have image mask {in_header}, expected one of "
+            f"{', '.join(MASKS)}"
+        )
+    along = bar_place(observation.header, observation.name)
+    module = module or module_of(observation.header, observation.name) or "A"
+    place = detector_place(name, str(observation.filter), along, module)
+    detector = detector_of(observation.header, observation.name)
+    if detector not in (None, place.header_detector):
+        raise IncompatibleSetupError(
+            f"{observation.name}: these frames are of the detector {detector}, expected "
+            f"{place.header_detector}, on which {name} is imaged in {observation.filter}"
+        )
+    return place
+
+
+def field_of(observation: Observation) -> Window:
+    """The pixels about the star in which its mask lets sources be seen; all of a subarray."""
+    if not observation.is_nircam:
+        return Window(0, 0, observation.shape)
+    (ny, nx), (x, y) = observation.shape, observation.pixelscale
+    height, width = min(ny, int(FIELD / y)), min(nx, int(FIELD / x))
+    box = Window.about(observation.mean_center, (height, width))
+    # Moved into the frame.
+    return Window(min(max(box.y, 0), ny - height), min(max(box.x, 0), nx - width), (height, width))
+
+
+def within_field(observation: Observation) -> Observation:
+    """The pixels of `field_of`."""
+    field = field_of(observation)
+    return observation if field.shape == observation.shape else observation.within(field)
+
+
+def pupil_samples(
+    observation: Observation, shape: tuple[int, int], npix: int, place: DetectorPlace | None = None
+) -> int:
+    """Pupil samples, `npix` or twice, four times ... as many, for images (ny, nx) behind a mask.
+
+    `place` is that of the star, by default the one of the observation's header.
+    """
+    period, (x, y) = 0.0, observation.pixelscale
+    if place is None and observation.is_nircam:
+        place = _place_of(observation)
+    if place is not None:
+        period, (x, y) = place.period(), place.siaf_pixelscale
+    shortest = float(filter_throughput(str(observation.filter))[0][0])
+    return doubled_samples(npix, max(shape[1] * x, shape[0] * y, period), shortest)
+
+
 def images_of_stars(
     observation: Observation, away: float, reach: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -167,9 +218,10 @@ def images_of_stars(
     They are monochromatic, with an arbitrary wavefront, and show `reach` (arcsec) about both.
     """
     size = 2 * int(np.ceil((away + reach) / np.mean(observation.pixelscale))) + 1
-    model = model_for(observation, size, nlambda=1, npix=128)
+    npix = pupil_samples(observation, (size, size), 128)
+    model = model_for(observation, size, nlambda=1, npix=npix)
     # Without a wavefront error the star would be too faint.
-    wavefront = random_opd(1, npix=128)
+    wavefront = random_opd(1, npix=npix)
     with torch.no_grad():
         images = [model(wavefront, (0.0, y)).double().cpu().numpy() for y in (0.0, away)]
     return images[0], images[1]
