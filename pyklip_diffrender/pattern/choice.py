@@ -17,7 +17,6 @@ from scipy.ndimage import fourier_shift
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits, product_in
-from pyklip_diffrender.io.headers import same_name
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern.library import (
@@ -371,11 +370,10 @@ def pattern_for_visit(
     ):
         return choice.systematics
     if is_known_beside(choice, references):
-        own = {each.target for each in references}
         patterns = [
             pattern
             for pattern in choice.library.patterns
-            if not any(same_name(pattern.star, star) for star in own)
+            if not any(shows_star(pattern, each) for each in references)
         ]
         known = known_systematics(
             science[0], _fits_beside(choice, references), library=PatternLibrary(tuple(patterns))

@@ -26,7 +26,7 @@ from pyklip_diffrender.io.files import (
     unpacked_name,
     write_fits,
 )
-from pyklip_diffrender.io.headers import fits_text, same_name
+from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pattern.measure import (
@@ -234,12 +234,14 @@ def known_systematics(
         library = package_library() if library else PatternLibrary()
     known = library.matching(observation)
     patterns = measure_patterns(references, common_pedestal(known) if known else None)
-    fitted = {pattern.star for pattern in patterns}
-    # Patterns are errors of one flat field, which is that of the reference stars if it is known.
-    flats = {pattern.flat for pattern in patterns} - {None}
-    known = [pattern for pattern in known if not flats or pattern.flat in flats]
+    fitted = [star for pattern in patterns for star in pattern.stars]
     if all(pattern.first_pixel is not None for pattern in patterns):
-        patterns += [p for p in known if not any(same_name(p.star, star) for star in fitted)]
+        # A star that was fitted counts once.
+        patterns += [
+            pattern
+            for pattern in known
+            if not any(own.is_same(star) for own in pattern.stars for star in fitted)
+        ]
     stated = [pattern for pattern in patterns if pattern.flat is not None]
     flat = _flat_for(stated, observation)
     patterns = [pattern for pattern in patterns if pattern.flat in (flat, None)]
