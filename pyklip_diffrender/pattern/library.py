@@ -234,9 +234,6 @@ def known_systematics(
     known = library.matching(observation)
     patterns = measure_patterns(references, common_pedestal(known) if known else None)
     fitted = {pattern.star for pattern in patterns}
-    # Patterns are errors of one flat field, which is that of the reference stars if it is known.
-    flats = {pattern.flat for pattern in patterns} - {None}
-    known = [pattern for pattern in known if not flats or pattern.flat in flats]
     if all(pattern.first_pixel is not None for pattern in patterns):
         patterns += [p for p in known if not any(same_name(p.star, star) for star in fitted)]
     stated = [pattern for pattern in patterns if pattern.flat is not None]
