@@ -3,8 +3,6 @@
 import random
 from itertools import combinations
 
-__all__ = ["cases_of_pairs", "is_possible", "missing_pairs"]
-
 _TRIES = 30
 """Cases of which the one with the most new pairs is taken."""
 
@@ -56,10 +54,10 @@ def _completed(case, levels, refused, wanted, chance):
     name = chance.choice(missing)
 
     def gain(level):
-        new = {name: level}
-        more = {pair for pair in wanted if (name, level) in pair}
-        return sum(set(pair) <= (case | new).items() for pair in more), chance.random()
+        more = (case | {name: level}).items()
+        return sum((name, level) in pair and set(pair) <= more for pair in wanted)
 
+    # Of levels that add as many pairs the first one, which is the usual one, comes first.
     for level in sorted(levels[name], key=gain, reverse=True):
         more = case | {name: level}
         if is_possible(more, refused):

@@ -370,12 +370,12 @@ def through_a_survey(request, folder):
     failed = table[table["status"] == "failed"]
     if len(failed):
         raise Refused("\n".join(failed["message"]))
-    plain = table[table["injected_contrast"].mask]
+    plain = table["injected_contrast"].mask
+    searches, summaries = _products(folder / "jobs" / name for name in table["folder"][plain])
+    for each in summaries:
+        each["injections"] = np.sum(~plain)  # These are jobs of their own.
     combined = table.meta["combined"]
-    return Found(
-        *_products(folder / "jobs" / name for name in plain["folder"]),
-        combined[0] if combined else None,
-    )
+    return Found(searches, summaries, combined[0] if combined else None)
 
 
 DOORS = {
