@@ -32,6 +32,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pyklip_backend.fitted_star import FittedPointing
 from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.reduction.pictures import _stamps
 from pyklip_diffrender.reduction.pipeline import _Run, prepare
 from pyklip_diffrender.scene import Sequence
 from pyklip_diffrender.scene.observation import Window
@@ -262,6 +263,27 @@ def test_a_faint_source_at_the_edges_of_the_fitted_pixels_is_fitted_with_the_sta
         assert (each.contrast, *each.offset) == pytest.approx((1e-5, *source.offset), rel=slack)
     failed = replace(alone, status=dr.Status.DIVERGED)
     assert run._with_sources_at_edges(failed) is failed
+    # The report shows the pixels about it that were fitted, and no others.
+    stamps = _stamps(result.detection, 0)
+    assert list(stamps) == [1, 2]
+    for stamp, frame in zip(stamps.values(), result.fit.frames, strict=True):
+        turned = source.rotated(frame.observation.roll_from(frames[0]))
+        assert (stamp.x.mean(), stamp.y.mean()) == pytest.approx(turned.offset, abs=0.06)
+        beyond = stamp.x > frame.grid[..., 0].max() + 0.03
+        assert np.isnan(stamp.data[:, beyond]).all()
+        assert np.isfinite(stamp.data[:, ~beyond]).any()
+
+
+@pytest.mark.parametrize(("whole", "fitted"), [(56, 24), (64, 32)])
+def test_frames_hardly_larger_than_the_fitted_pixels_have_no_sources_at_their_edges(whole, fitted):
+    """All of the smaller one is near the star, where no light is that of the background."""
+    frame = dr.simulate(model(whole + 4), dr.Scene(STAR), dr.random_opd(1, npix=128), seed=5)
+    # The star is not in the middle, so that columns and rows that are searched are not fitted.
+    frame = frame.within(Window(4, 4, (whole, whole)))
+    settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False)
+    opd = dr.random_opd(1, npix=128)
+    fit = dr.refine(model(fitted), frame.cutout(fitted), opd, settings=settings)
+    assert sources_at_edges(fit, [frame]) == []
 
 
 def test_pixels_that_light_from_beyond_blurs_into_are_left_out():

@@ -140,7 +140,7 @@ class WholeFrame:
         image = np.asarray(combined.data[0] - self.stars)
         separation = separation_of(self.grid)
         # Of a small frame, its outer part.
-        core = min(_CORE, 0.7 * float(separation.max()))
+        core = min(_CORE, 0.7 * float(separation[combined.valid[0]].max()))
         unused = ~combined.valid[0] | (separation < core)
         ground = Background2D(
             np.where(combined.valid[0], image, 0.0),
@@ -517,7 +517,8 @@ def _point_sources(
     image, least = frame.residual, _BRIGHT
     while allowed.any() and len(sources) < _MOST:
         numerator, information = frame.products(image)
-        snr = np.where(allowed, numerator / np.sqrt(np.maximum(information, 1e-300)), 0.0)
+        snr = np.zeros_like(numerator)
+        np.divide(numerator, np.sqrt(information), snr, where=allowed & (information > 0))
         if at_edges and not sources:
             least = _DEVIATIONS * max(float(mad_std(snr[allowed])), 1.0)
         row, column = np.unravel_index(snr.argmax(), snr.shape)

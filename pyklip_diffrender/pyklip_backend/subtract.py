@@ -138,8 +138,8 @@ def _give_back(
     if not len(candidates):
         return
     # The star has taken J H^-1 G (their light); those that are companions of the fit, none.
-    linear, templates = detection.groups[0]
-    change = linear.response(candidates.light(templates))[:, 0]
+    _, templates = detection.groups[0]
+    change = fitted[0].result.linear.response(candidates.light(templates))[:, 0]
     for part in fitted:
         star[part.pointing.frames] -= part.change_in_frames(change)
 

@@ -32,6 +32,7 @@ from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.reduction.pages import Picture, number, plus_minus, scientific
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
+from pyklip_diffrender.scene.observation import Window
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 from pyklip_diffrender.scene.star_place import without_gaps
 
@@ -418,7 +419,7 @@ def _candidate(detection: Detection, place: int) -> list[Picture]:
             "candidates; the model of the source, on the same scale; and what is left, in standard "
             "deviations of the noise. The cross marks the fitted position.",
         )
-        for frame, stamp in enumerate(stamps, 1)
+        for frame, stamp in stamps.items()
     ]
     names, values, covariance = _measured(detection, place)
     power = int(np.floor(np.log10(values[0])))
@@ -454,34 +455,41 @@ def _source_of(detection: Detection, place: int) -> int:
     return int(np.argsort(-detection.sources.snr(detection.error_factor))[place])
 
 
-def _stamps(detection: Detection, place: int) -> list[drawing.Stamp]:
-    """The pixels about a candidate in the first frames."""
+def _stamps(detection: Detection, place: int) -> dict[int, drawing.Stamp]:
+    """The pixels about a candidate in the first frames that show some, by their number from 1."""
     templates, sources = detection.groups[0][1], detection.sources
     index = _source_of(detection, place)
     offset = sources.offsets[index : index + 1]
     light, together = templates.at(offset), sources.light(templates)
-    stamps = []
-    for k, frame in list(templates.frames.items())[:MOST_FRAMES]:
+    stamps = {}
+    for shown, (k, frame) in enumerate(list(templates.frames.items())[:MOST_FRAMES], 1):
         subtracted = detection.subtracted[k]
         observation = frame.observation.combined()
         own = float(sources.contrasts[index]) * light[k][0].numpy()
         row, column = np.rint(templates.pixels_of(k, offset)[:, 0]).astype(int)
         half = max(3, round(_STAMP / float(np.sqrt(np.prod(observation.pixelscale)))))
-        window = slice(row, row + 2 * half + 1), slice(column, column + 2 * half + 1)
+        window = Window(row - half, column - half, (2 * half + 1, 2 * half + 1))
         valid = observation.valid[0]
+        # A source just beyond the fitted pixels is seen in these by its side lobes only.
+        if not window.cut(observation.valid, False).any():
+            continue
+        nearest = np.clip((row, column), 0, np.subtract(valid.shape, 1))
+        beyond = np.subtract((column, row), nearest[::-1])
         x, y = (
-            axis + scale * np.arange(-half, half + 1)
-            for axis, scale in zip(frame.grid[row, column], observation.pixelscale, strict=True)
+            axis + scale * (pixels + np.arange(-half, half + 1))
+            for axis, scale, pixels in zip(
+                frame.grid[*nearest], observation.pixelscale, beyond, strict=True
+            )
         )
         # Of all candidates, only the light of this one stays in the picture without the star.
         data, left, model, noise = (
-            np.pad(np.where(valid, image, np.nan), half, constant_values=np.nan)[window]
+            window.cut(np.where(valid, image, np.nan)[np.newaxis], np.nan)[0]
             for image in (
                 observation.data[0], subtracted - together[k][0].numpy() + own, own,
                 observation.error[0],
             )
         )  # fmt: skip
-        stamps.append(drawing.Stamp(x, y, data, left, model, noise, observation.north))
+        stamps[shown] = drawing.Stamp(x, y, data, left, model, noise, observation.north)
     return stamps
 
 
