@@ -43,6 +43,11 @@ def cases_of_pairs(levels, refused=()):
         best = max(tries, key=lambda case: len(pairs_in(case).intersection(wanted)))
         cases.append(best)
         wanted = [pair for pair in wanted if pair not in pairs_in(best)]
+    for case in cases[:]:
+        others = [each for each in cases if each is not case]
+        # The later ones may have all pairs of an earlier one.
+        if not missing_pairs(others, levels, refused):
+            cases = others
     return cases
 
 
