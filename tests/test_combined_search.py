@@ -500,6 +500,27 @@ def test_headers_that_disagree_on_the_motion_are_refused():
         dr.combine([dated(59900.0, 0.3), dated(60300.0, 0.9)])
 
 
+def test_coordinates_of_other_epochs_are_of_one_star():
+    """A star that moves by 4.5 arcsec a year, with coordinates of 2000 and of 2023."""
+    year = 4.5 / 3600
+
+    def dated(mjd, declination):
+        cards = {
+            "TARGPROP": "fast",
+            "TARG_RA": 80.0,
+            "TARG_DEC": declination,
+            "MU_RA": 0.0,
+            "MU_DEC": 4.5,
+            "MU_EPOCH": "2000.0",
+            "DATE-BEG": Time(mjd, format="mjd").isot,
+        }
+        return found("F444W", int(mjd), [(*ONE, 12.0)], mjd=mjd, header=cards)
+
+    both = dr.combine([dated(59900.0, -30.0), dated(60300.0, -30.0 + 24.0 * year)])
+    assert both.motion.proper == (0.0, 4.5)
+    assert list(both.candidates["verdict"]) == [BOUND]
+
+
 def test_a_candidate_below_the_threshold_of_the_combination_is_named():
     """The threshold of two filters is 5.3, that of each is 5."""
     one = found("F444W", 3, [(*ONE, 5.2)], threshold=4.0)
