@@ -173,15 +173,10 @@ def _reduction(star: str, band: str, data: Path, **options: object) -> Numbers:
 CASES: dict[str, Callable[[Path], Numbers]] = {
     "HIP-65426": lambda data: numbers_of(reduced(data, "HIP-65426")),
     "HIP-65426, wide": lambda data: numbers_of(reduced(data, "HIP-65426", wide=True)),
+    **{f"{star}, {band}": partial(_reduction, star, band) for star in STARS[:2] for band in BANDS},
+    "V-AU-MIC, F444W, disk": partial(_reduction, "V-AU-MIC", "F444W", disk=True),
     **{
-        f"{star}, {band}": partial(_reduction, star, band, disk=star == "V-AU-MIC")
-        for star in STARS
-        for band in BANDS
-    },
-    **{
-        f"{star}, {band}, roll {k + 1}": partial(
-            _reduction, star, band, rolls=slice(k, k + 1), disk=star == "V-AU-MIC"
-        )
+        f"{star}, {band}, roll {k + 1}": partial(_reduction, star, band, rolls=slice(k, k + 1))
         for star in STARS
         for band in BANDS
         for k in range(2)
