@@ -8,7 +8,7 @@ import os
 import threading
 import warnings
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Protocol
@@ -37,7 +37,6 @@ from pyklip_diffrender.pyklip_backend.source_frames import keeping_references, k
 __all__ = [
     "ALGORITHM",
     "BLOCK",
-    "BOTH",
     "REGISTRY",
     "Patched",
     "Patches",
@@ -46,7 +45,6 @@ __all__ = [
     "dispatch_fm",
     "is_ours",
     "is_registered",
-    "name_of",
     "reduce_jwst_files",
     "register",
     "settings_for",
@@ -59,9 +57,6 @@ __all__ = [
 
 ALGORITHM = "diffrender"
 """Value of the argument `algo` of `klip_dataset`."""
-
-BOTH = f"{ALGORITHM}+klip"
-"""Name of the algorithm that writes KLIP's products beside those of this backend."""
 
 
 class Patched(Protocol):
@@ -111,15 +106,10 @@ def _takes_klip() -> bool | None:
     return REGISTRY.replace if force is None else force
 
 
-def name_of(algo: Any) -> str:
-    """The argument `algo` in lower case and without spaces."""
-    return "".join(str(algo).lower().split())
-
-
 def is_ours(algo: Any) -> bool:
     """Whether a call with this `algo` is for this backend."""
-    name = name_of(algo)
-    return name in (ALGORITHM, BOTH) or (name == "klip" and bool(_takes_klip()))
+    name = str(algo).lower()
+    return name == ALGORITHM or (name == "klip" and bool(_takes_klip()))
 
 
 def _outside_block() -> bool:
@@ -231,10 +221,7 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
     arguments = call.arguments
     if is_ours(arguments["algo"]):
         settings = settings_for(arguments["dataset"])
-        before = dict(vars(arguments["dataset"]))
         DatasetReduction(arguments, settings).run(klip_dataset.original)
-        if name_of(arguments["algo"]) == BOTH:
-            _run_klip(klip_dataset.original(), arguments, before)
     else:
         if str(arguments["algo"]).lower() == "klip":
             warn_of_klip(arguments["dataset"], "klip_dataset")
@@ -243,33 +230,9 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
         mark_filtered(arguments["dataset"])
 
 
-def _run_klip(
-    klip_dataset: Callable[..., None], arguments: Mapping[str, Any], before: Mapping[str, Any]
-) -> None:
-    """Write KLIP's products beside those of this backend, whose results stay in the dataset.
-
-    KLIP starts from the attributes that the dataset had `before` the call.
-    """
-    attributes = vars(arguments["dataset"])
-    after = dict(attributes)
-    attributes.clear()
-    attributes.update(before)
-    try:
-        prefix = f"{arguments['fileprefix']}-klip"
-        klip_dataset(**{**arguments, "algo": "klip", "fileprefix": prefix})
-    finally:
-        attributes.clear()
-        attributes.update(after)
-
-
 def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
     """Handle a call of `pyklip.fm.klip_dataset`, to which this package adds an argument `algo`."""
     klip_dataset = _patches().fm_klip_dataset
-    if name_of(kwargs.get("algo")) == BOTH:
-        raise IncompatibleSetupError(
-            f"algo: pyklip.fm.klip_dataset takes 'diffrender' or 'klip', not {BOTH!r}, because an "
-            "fm_class is for one of them. Call it twice"
-        )
     if not is_ours(kwargs.get("algo", "klip")):
         warn_of_klip(args[0] if args else kwargs.get("dataset"), "pyklip.fm.klip_dataset")
         return klip_dataset.original()(*args, **kwargs)
