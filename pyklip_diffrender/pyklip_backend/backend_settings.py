@@ -59,7 +59,7 @@ OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Qua
 _RULES: dict[str, Rule] = {"closest": "nearest", **{rule: rule for rule in RULES}}
 """Values of `opd` that choose a map from `opd_folder`, and the rule for `choose_map`."""
 
-IMAGES = ("cleaned", "flux", "subtracted")
+IMAGES = ("cleaned", "subtracted")
 """Images that the products can carry."""
 
 ATTRIBUTE = "diffrender"
@@ -123,16 +123,14 @@ class DiffrenderSettings:
         Flux density of the star in the filter, to which contrasts then refer; see `reduce`.
     star_flux_error : float, optional
         Its relative error.
-    image : {"cleaned", "flux", "subtracted"}, optional
+    image : {"cleaned", "subtracted"}, optional
         Image that the products carry. "subtracted", always that of forward models and the default
         but for real NIRCam frames, is each frame minus its star. "cleaned", the default for real
         NIRCam frames, is the posterior mean of the sky from all rolls together, see
         ``imaging.SkyModel``: sources are as sharp as in the frames but have no side lobes, which
         takes up to half of the light of a disk. Every frame has it on its own pixels, so that
-        pyKLIP's mean or median of the frames is the same image. "flux" has in each pixel the most
-        probable peak of a point source there, from all rolls together with the star marginalised:
-        its noise is that of the closed-form limits, and it keeps all light of a source. Pixels
-        beyond the fitted square have the frames minus star.
+        pyKLIP's mean or median of the frames is the same image. Pixels beyond the fitted square
+        have the frames minus star.
     max_chi2 : float, optional
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.
@@ -183,7 +181,7 @@ class DiffrenderSettings:
     disk: bool | None = None
     star_flux: float | str | u.Quantity | None = None
     star_flux_error: float | None = None
-    image: Literal["cleaned", "flux", "subtracted"] | None = None
+    image: Literal["cleaned", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None
     files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None

@@ -543,8 +543,6 @@ class DatasetReduction:
         """Fraction of a faint source's peak that the products have, on the first frame's pixels."""
         if record.image == "cleaned":
             return record.images.sky.throughput()
-        if record.image == "flux":
-            return np.ones(result.frames[0].grid.shape[:2])  # It is marginalised over the star.
         return throughput_map(result)
 
     def _image(self, subtraction: Subtraction) -> str:
@@ -605,7 +603,7 @@ class DatasetReduction:
             # The model of the sky is that of the fit, also for copies with added sources.
             original = before[len(self.records)] if before else record
             added = frames.data - original.frames.data if before else None
-            original.images.put_into(residuals, image, added)
+            original.images.put_into(residuals, added)
         self.records.append(record)
         # The fit has the unit of the files; whoever multiplied the dataset gets it multiplied.
         residuals *= frames.factor[:, np.newaxis, np.newaxis]
