@@ -13,11 +13,9 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -26,17 +24,8 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
-from pyklip_diffrender.io.files import fits_files, stamps
 from pyklip_diffrender.options import OPTIONS
-from pyklip_diffrender.wavefront.opd import (
-    RULES,
-    OPDMap,
-    Rule,
-    as_opd_map,
-    choose_map,
-    wavefront_for,
-)
-from pyklip_diffrender.wavefront.opd_map import FLAT
+from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
 if TYPE_CHECKING:
     from pyklip_diffrender.pattern import PatternLibrary
@@ -56,9 +45,6 @@ __all__ = [
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
 """A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
 
-_RULES: dict[str, Rule] = {"closest": "nearest", **{rule: rule for rule in RULES}}
-"""Values of `opd` that choose a map from `opd_folder`, and the rule for `choose_map`."""
-
 IMAGES = ("cleaned", "subtracted")
 """Images that the products can carry."""
 
@@ -75,11 +61,8 @@ class DiffrenderSettings:
     opd : path, ndarray, Quantity or OPDMap, optional
         Wavefront map to start from: a FITS file, or a square array in metres, OTE entrance-pupil
         orientation. There is no default: a reduction without one raises `MissingOPDError`. Of a
-        folder of maps, the one closest in time to the frames is taken; "flat" stands for a flat
-        wavefront.
-    opd_folder : path, optional
-        Folder of maps from which `opd` chooses: "nearest", the last one "before" the frames, the
-        first one "after" them, or "interpolate"; see `choose_map`.
+        folder of maps, the one closest in time to the frames is taken; see `choose_map` for other
+        rules. "flat" stands for a flat wavefront.
     model : optical model or mapping, optional
         From `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
         from the wavelength in ``dataset.wvs`` to a model. Made for the filter if not given.
@@ -138,9 +121,6 @@ class DiffrenderSettings:
         A dataset that has been reduced. Those of the calls are copies of it to which faint sources
         were added; the star is not fitted to them again, but what it takes of the sources follows
         from the linear model of the fit. For contrast curves by injection.
-    files : path or sequence of path, optional
-        Files, or folders with the files, that a `JWSTData` was read from before `register`. The
-        errors and pixels of files in the current folder are found without it.
     threads : int, optional
         Number of threads of a reduction; PyTorch's choice by default. 1 is best on a busy machine.
     model_options : mapping, optional
@@ -165,7 +145,6 @@ class DiffrenderSettings:
     """
 
     opd: OPDLike | None = None
-    opd_folder: str | os.PathLike[str] | None = None
     model: Any = None
     filter: str | None = None
     pixelscale: float | tuple[float, float] | None = None
@@ -184,7 +163,6 @@ class DiffrenderSettings:
     image: Literal["cleaned", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None
-    files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None
     threads: int | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
@@ -305,19 +283,7 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
     DiffrenderWarning
         If the map is more than 200 days from the date.
     """
-    opd, folder = settings.opd, settings.opd_folder
-    if isinstance(opd, str) and opd in _RULES:
-        if folder is None:
-            raise MissingOPDError(
-                f"opd={opd!r} chooses a wavefront map by its date: give the folder with the maps "
-                "as opd_folder"
-            )
-        return _chosen(folder, date, _RULES[opd])
-    if opd is None and folder is not None:
-        return _chosen(folder, date, "nearest")
-    if isinstance(opd, str | os.PathLike) and opd != FLAT and Path(opd).is_dir():
-        return _chosen(opd, date, "nearest")
-    if opd is None:
+    if settings.opd is None:
         raise MissingOPDError(
             "algo='diffrender' starts from a measured wavefront map and none was given. Give a "
             "FITS file, an array in metres or a Quantity, in one of three ways: "
@@ -326,34 +292,4 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
             "closest in time to the observation, or give the folder with your maps; opd='flat' "
             "starts without one"
         )
-    if isinstance(opd, str | os.PathLike) and opd != FLAT:
-        path = Path(opd).resolve()
-        # A contrast curve reads the same map for each of its 120 reductions.
-        opd = _read(path, tuple(stamps([path]).items()))
-    return wavefront_for(opd, date)
-
-
-@lru_cache(maxsize=4)
-def _read(path: Path, version: tuple[Any, ...]) -> OPDMap:
-    """Read a map once for each version of its file."""
-    return as_opd_map(path)
-
-
-def _chosen(folder: str | os.PathLike[str], date: Time | None, rule: Rule) -> OPDMap:
-    """Choose a map from a folder."""
-    if date is None:
-        raise IncompatibleSetupError(
-            f"{folder} is a folder of wavefront maps, and the date of the frames is not known. "
-            "Make the JWSTData after register(), whose frames must have DATE-BEG in their header, "
-            "or give the file of the map as opd"
-        )
-    path = Path(folder).resolve()
-    # The time of the folder does not say whether one of its files was written again.
-    files = fits_files(path) if path.is_dir() else ()
-    return _choose_once(path, tuple(stamps(files).items()), date.isot, rule)
-
-
-@lru_cache(maxsize=4)
-def _choose_once(folder: Path, version: tuple[Any, ...], date: str, rule: Rule) -> OPDMap:
-    """Choose a map once for each state of the files in the folder."""
-    return choose_map(folder, date, rule)
+    return wavefront_for(settings.opd, date)
