@@ -24,7 +24,7 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
-from pyklip_diffrender.options import OPTIONS
+from pyklip_diffrender.options import OPTIONS, ReduceOptions
 from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
 if TYPE_CHECKING:
@@ -82,30 +82,16 @@ class DiffrenderSettings:
         Unit of the frames. Read from BUNIT if present, else dimensionless.
     fit : GaussNewton, optional
         Settings of the fit; see `refine`.
-    start : dict, optional
-        Starting values by parameter name; see `refine`.
     systematics : Systematics, PatternLibrary, path, "auto", "references" or "off", optional
         Flat-field pattern. "auto", the default for real NIRCam frames, takes that of the
         package's library, and fits the reference frames only where it has none; "references" fits
         them in any case and uses both; a library, its file, or a folder of such files is searched
         besides the package's; see `reduce`. Reference frames are those of a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.
-    references : {"joint", "pattern", "off"}, optional
-        What the reference frames are for: with "joint", the default, they are fitted together with
-        the target's where that makes limits deeper; see `reduce`.
     keep_detected : bool, optional
         Subtract none of the light of detected companions with the star; True by default for real
         NIRCam frames, else False. Bright ones are part of the fit in any case, as in `reduce`.
         Undetected companions still lose light, as much as the throughput map says.
-    threshold : float, optional
-        S/N of a detected companion; see `reduce`.
-    disk : bool, optional
-        Fit extended light about the star together with it, see `fit_disk`, so that a disk is not
-        subtracted with the star. False by default.
-    star_flux : float, str or Quantity, optional
-        Flux density of the star in the filter, to which contrasts then refer; see `reduce`.
-    star_flux_error : float, optional
-        Its relative error.
     image : {"cleaned", "subtracted"}, optional
         Image that the products carry. "subtracted", always that of forward models and the default
         but for real NIRCam frames, is each frame minus its star. "cleaned", the default for real
@@ -123,6 +109,7 @@ class DiffrenderSettings:
         from the linear model of the fit. For contrast curves by injection.
     threads : int, optional
         Number of threads of a reduction; PyTorch's choice by default. 1 is best on a busy machine.
+    (see the options)
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
@@ -169,30 +156,22 @@ class DiffrenderSettings:
 
     def __post_init__(self) -> None:
         from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-        from pyklip_diffrender.pattern import as_request
-        from pyklip_diffrender.refinement import GaussNewton, to_jansky
+        from pyklip_diffrender.refinement import GaussNewton
 
-        # Alike for `reduce`. What is read from files is kept: settings are merged for every call.
-        for name, option in OPTIONS.items():
-            value = getattr(self, name, None)
-            if value is None or name == "start":
-                continue
-            if name == "star_flux":
-                to_jansky(value)
-            elif name == "systematics":
-                object.__setattr__(self, name, as_request(value))
-            else:
-                option.checked(value)
+        options = ReduceOptions(**self.given)
+        if self.systematics is not None:
+            # What is read from files is kept: settings are merged for every call.
+            object.__setattr__(self, "systematics", options.systematics)
         if self.fit_pixels is not None:
             replace(OPTIONS["size"], name="fit_pixels").checked(self.fit_pixels)
         choices = (
             ("image", self.image, IMAGES),
             ("keep_detected", self.keep_detected, (True, False)),
         )
-        for name, value, allowed in choices:
-            if value is not None and value not in allowed:
+        for name, chosen, allowed in choices:
+            if chosen is not None and chosen not in allowed:
                 raise IncompatibleSetupError(
-                    f"{name}: got {value!r}, expected one of {', '.join(map(str, allowed))}"
+                    f"{name}: got {chosen!r}, expected one of {', '.join(map(str, allowed))}"
                 )
         threads = self.threads
         if threads is not None and not (isinstance(threads, int) and threads >= 1):
@@ -216,6 +195,12 @@ class DiffrenderSettings:
                 f"{', '.join(sorted(known))}"
             )
 
+    @property
+    def given(self) -> dict[str, Any]:
+        """Options that are set here, of those that `reduce` has under the same name."""
+        values = {name: getattr(self, name, None) for name in OPTIONS}
+        return {name: value for name, value in values.items() if value is not None}
+
     def over(self, other: DiffrenderSettings) -> DiffrenderSettings:
         """Complete the settings by those of `other`."""
         merged: dict[str, Any] = {}
@@ -228,6 +213,15 @@ class DiffrenderSettings:
     def __deepcopy__(self, memo: dict[int, Any]) -> DiffrenderSettings:
         """Itself: it never changes, and a contrast curve copies its dataset 120 times."""
         return self
+
+
+DiffrenderSettings.__doc__ = inspect.cleandoc(DiffrenderSettings.__doc__ or "").replace(
+    "(see the options)",
+    "\n".join(
+        OPTIONS[name].entry
+        for name in ("start", "references", "threshold", "disk", "star_flux", "star_flux_error")
+    ),
+)
 
 
 def settings_of(dataset: Any) -> DiffrenderSettings:
