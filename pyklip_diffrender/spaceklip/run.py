@@ -120,7 +120,8 @@ def run_obs(
     verbose : bool
         Print what is being done.
     **settings
-        Other fields of `DiffrenderSettings`, such as `systematics` and `threshold`.
+        Other fields of `DiffrenderSettings`, such as `systematics`, `threshold` and
+        `star_flux_error`.
 
     Returns
     -------
