@@ -5,7 +5,7 @@ Run from the root of the project, with the frames of programme 1184 in ../shared
     python -m benchmarks.images --target G-7-34 --filter F444W
 
 The rolls of a target are reduced with KLIP (ADI+RDI, all other stars as references, 1 to 5 modes)
-and with this package (images "cleaned" and "flux"). The noise of each product is that
+and with this package (image "cleaned"). The noise of each product is that
 of `pyklip.klip.meas_contrast`; its throughput is that of planets injected with
 `fakes.inject_planet`, a few times brighter than the noise so that both algorithms are linear, and
 measured with `fakes.retrieve_planet_flux`. They have the image of a point source behind the Lyot
@@ -40,7 +40,7 @@ Image = NDArray[np.float64]
 SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
 ANGLES = np.arange(20.0, 380.0, 60.0)
 MODES = [1, 2, 3, 4, 5]
-OURS = ("cleaned", "flux")
+OURS = "cleaned"
 STAMP = 41
 """Side of the image of a planet, pixels."""
 
@@ -120,16 +120,11 @@ def main() -> None:
     ]
     dr.register(opd=options.opd)
     dataset = JWSTData(*names, center_include_offset=False)
-    plain = {name: copy.deepcopy(dataset) for name in ("KLIP", *OURS)}
+    plain = {name: copy.deepcopy(dataset) for name in ("KLIP", OURS)}
     images = {"KLIP": reduced(plain["KLIP"], "klip", MODES)}
-    first = plain[OURS[0]]
-    for name in OURS:
-        # The frames are fitted once.
-        plain[name].diffrender = dr.DiffrenderSettings(
-            image=name, disk=options.disk is not None,
-            injected_into=None if name == OURS[0] else first,
-        )  # fmt: skip
-        images[name] = reduced(plain[name], "diffrender", [1])
+    first = plain[OURS]
+    first.diffrender = dr.DiffrenderSettings(image=OURS, disk=options.disk is not None)
+    images[OURS] = reduced(first, "diffrender", [1])
     fit = first.diffrender_results[0].subtraction.fits[0].result
     model = fit.model
     scale = float(np.mean(model.detector.pixelscale))
@@ -155,7 +150,8 @@ def main() -> None:
             place = (separation / scale, angle)
             for name in images:
                 copied = copy.deepcopy(dataset)
-                if name in OURS:
+                if name == OURS:
+                    # The frames are fitted once.
                     copied.diffrender = dr.DiffrenderSettings(image=name, injected_into=first)
                 planets = [peak if stamp is None else peak * stamp] * len(copied.input)
                 fakes.inject_planet(
@@ -177,13 +173,12 @@ def main() -> None:
             for name, each in background.items()
         }  # fmt: skip
         print("after the Gaussian filter" if smooth else "raw", "image, KLIP, ours, ratio, kept")
-        for name in OURS:
-            ratio = best["KLIP"] / best[name]
-            for k, separation in enumerate(SEPARATIONS):
-                values = best["KLIP"][k], best[name][k], ratio[k]
-                print(f"{name} {separation:.1f}  {values[0]:.3g}  {values[1]:.3g}  {values[2]:.2f}"
-                      f"  {kept[name][0, k]:.2f}")  # fmt: skip
-            print(f"{name}: median ratio {np.median(ratio):.2f}", flush=True)
+        ratio = best["KLIP"] / best[OURS]
+        for k, separation in enumerate(SEPARATIONS):
+            values = best["KLIP"][k], best[OURS][k], ratio[k]
+            print(f"{separation:.1f}  {values[0]:.3g}  {values[1]:.3g}  {values[2]:.2f}"
+                  f"  {kept[OURS][0, k]:.2f}")  # fmt: skip
+        print(f"median ratio {np.median(ratio):.2f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ Every public name is loaded when it is first used, so that ``import pyklip_diffr
 
 from __future__ import annotations
 
-import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -171,16 +170,5 @@ def __getattr__(name: str) -> Any:
     return value
 
 
-def _watch_in_spawned_process() -> None:
-    """Load the backend in a process that was spawned in a `backend` block, see its `patch`."""
-    if "PYKLIP_DIFFRENDER_TAKES_KLIP" in os.environ:
-        patch = import_module(f"{__name__}.pyklip_backend.patch")
-        if patch.spawned_beside_klip():
-            import_module(f"{__name__}.pyklip_backend.registration")
-
-
 def __dir__() -> list[str]:
     return sorted([*__all__, *_SUBMODULES])
-
-
-_watch_in_spawned_process()

@@ -202,24 +202,6 @@ def test_every_file_keyword_and_slice_is_there_as_klip_leaves_it(
 
 
 @pytest.mark.usefixtures("registered")
-def test_both_algorithms_in_one_call(imgs, tmp_path):
-    alone = {algo: (generic(imgs, ANGLES), tmp_path / algo) for algo in ("klip", "diffrender")}
-    expected = {
-        algo: reduced(*each, algo=algo, highpass=8.0)[PRODUCT][0] for algo, each in alone.items()
-    }
-    dataset = generic(imgs, ANGLES)
-    with backend():
-        files = reduced(dataset, tmp_path / "both", algo="diffrender + KLIP", highpass=8.0)
-    for name, algo in (("x", "diffrender"), ("x-klip", "klip")):
-        data, header = files[f"{name}-KLmodes-all.fits"]
-        np.testing.assert_array_equal(data, expected[algo])
-        assert ("DRALGO" in header) == (algo == "diffrender")
-    np.testing.assert_array_equal(dataset.output, alone["diffrender"][0].output)
-    np.testing.assert_array_equal(dataset.input, alone["diffrender"][0].input)
-    assert len(dataset.diffrender_results) == 1
-
-
-@pytest.mark.usefixtures("registered")
 def test_the_companion_stays_whole_and_the_star_and_the_pedestal_go(imgs, tmp_path):
     dataset = generic(imgs, ANGLES)
     image, _ = reduced(dataset, tmp_path, aligned_center=CENTER)[PRODUCT]

@@ -10,7 +10,7 @@ from astropy.io import fits
 from backend_scene import OPD, RIPPLE, calints, in_place_of_fits, psf, reduced, render
 from pyklip.instruments.JWST import JWSTData
 
-from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
@@ -236,45 +236,22 @@ def maps(tmp_path):
     return folder
 
 
-@pytest.mark.parametrize(
-    ("opd", "date", "hours"),
-    [
-        ("folder", "2022-08-01", 46.966), (None, "2022-08-01", 46.966),
-        ("closest", "2022-08-01", 46.966), ("before", "2022-07-28", -49.034),
-    ],
-)  # fmt: skip
-def test_the_map_of_a_folder_is_chosen_by_the_date(opd, date, hours, maps, files, tmp_path):
+def test_the_map_of_a_folder_is_chosen_by_the_date(maps, files, tmp_path):
     unregister()
-    options = {"opd": maps} if opd == "folder" else {"opd": opd, "opd_folder": maps}
-    register(subtractor=render, **options)
+    register(subtractor=render, opd=maps)
     header = reduce(JWSTData(files[:2]), tmp_path / "out", mode="ADI")
-    assert header["DROPD"] == f"map_{date}.fits"
-    assert header["DROPDDAT"].startswith(date)
-    assert header["DROPDHRS"] == pytest.approx(hours, abs=0.001)
+    assert header["DROPD"] == "map_2022-08-01.fits"
+    assert header["DROPDDAT"].startswith("2022-08-01")
+    assert header["DROPDHRS"] == pytest.approx(46.966, abs=0.001)
 
 
-def test_a_map_that_was_written_again_is_chosen_by_its_new_date(maps, files, tmp_path):
-    """Writing into a file does not change the time of its folder."""
-    unregister()
-    register(opd=maps, subtractor=render)
-    first = reduce(JWSTData(files[:2]), tmp_path / "first", mode="ADI")
-    chosen = maps / first["DROPD"]
-    time = maps.stat().st_mtime_ns
-    fits.setval(chosen, "DATE-OBS", value="2022-12-01T00:00:00")
-    assert maps.stat().st_mtime_ns == time
-    second = reduce(JWSTData(files[:2]), tmp_path / "second", mode="ADI")
-    assert (first["DROPD"], second["DROPD"]) == ("map_2022-08-01.fits", "map_2022-07-28.fits")
-
-
-def test_a_map_needs_a_folder_and_the_frames_a_date(maps, files, tmp_path):
+def test_a_folder_needs_a_date_of_the_frames(maps, files, tmp_path):
     unregister()
     undated = JWSTData(files[:2])
-    register(opd="closest", subtractor=render)
-    with pytest.raises(MissingOPDError, match="as opd_folder"):
+    register(opd=maps, subtractor=render)
+    with pytest.raises(IncompatibleSetupError, match="frames have no date") as raised:
         reduce(undated, tmp_path / "out", mode="ADI")
-    register(opd_folder=maps)
-    with pytest.raises(IncompatibleSetupError, match=r"after register\(\).*DATE-BEG"):
-        reduce(undated, tmp_path / "out", mode="ADI")
+    assert "made before register()" in raised.value.__notes__[0]
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,10 @@ def test_settings_of_the_backend_are_unset_and_those_of_spaceklip_are_the_usual_
     shared = settings.keys() & OPTIONS.keys()
     assert {"threshold", "disk", "star_flux_error"} < shared
     assert all(settings[name] is None for name in shared)
+    documented = " ".join((inspect.getdoc(dr.DiffrenderSettings) or "").split())
+    # What differs from `reduce` is said there: the default, and where reference frames are from.
+    for name in shared - {"systematics", "max_chi2"}:
+        assert OPTIONS[name].meaning in documented
     for name, each in inspect.signature(run_obs).parameters.items():
         if name in OPTIONS and each.kind is not each.VAR_KEYWORD:
             assert each.default == OPTIONS[name].default

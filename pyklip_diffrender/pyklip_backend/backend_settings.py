@@ -13,11 +13,9 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -26,17 +24,8 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
-from pyklip_diffrender.io.files import fits_files, stamps
-from pyklip_diffrender.options import OPTIONS
-from pyklip_diffrender.wavefront.opd import (
-    RULES,
-    OPDMap,
-    Rule,
-    as_opd_map,
-    choose_map,
-    wavefront_for,
-)
-from pyklip_diffrender.wavefront.opd_map import FLAT
+from pyklip_diffrender.options import OPTIONS, ReduceOptions
+from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
 
 if TYPE_CHECKING:
     from pyklip_diffrender.pattern import PatternLibrary
@@ -56,10 +45,7 @@ __all__ = [
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
 """A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
 
-_RULES: dict[str, Rule] = {"closest": "nearest", **{rule: rule for rule in RULES}}
-"""Values of `opd` that choose a map from `opd_folder`, and the rule for `choose_map`."""
-
-IMAGES = ("cleaned", "flux", "subtracted")
+IMAGES = ("cleaned", "subtracted")
 """Images that the products can carry."""
 
 ATTRIBUTE = "diffrender"
@@ -75,11 +61,8 @@ class DiffrenderSettings:
     opd : path, ndarray, Quantity or OPDMap, optional
         Wavefront map to start from: a FITS file, or a square array in metres, OTE entrance-pupil
         orientation. There is no default: a reduction without one raises `MissingOPDError`. Of a
-        folder of maps, the one closest in time to the frames is taken; "flat" stands for a flat
-        wavefront.
-    opd_folder : path, optional
-        Folder of maps from which `opd` chooses: "nearest", the last one "before" the frames, the
-        first one "after" them, or "interpolate"; see `choose_map`.
+        folder of maps, the one closest in time to the frames is taken; see `choose_map` for other
+        rules. "flat" stands for a flat wavefront.
     model : optical model or mapping, optional
         From `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
         from the wavelength in ``dataset.wvs`` to a model. Made for the filter if not given.
@@ -99,40 +82,24 @@ class DiffrenderSettings:
         Unit of the frames. Read from BUNIT if present, else dimensionless.
     fit : GaussNewton, optional
         Settings of the fit; see `refine`.
-    start : dict, optional
-        Starting values by parameter name; see `refine`.
     systematics : Systematics, PatternLibrary, path, "auto", "references" or "off", optional
         Flat-field pattern. "auto", the default for real NIRCam frames, takes that of the
         package's library, and fits the reference frames only where it has none; "references" fits
         them in any case and uses both; a library, its file, or a folder of such files is searched
         besides the package's; see `reduce`. Reference frames are those of a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.
-    references : {"joint", "pattern", "off"}, optional
-        What the reference frames are for: with "joint", the default, they are fitted together with
-        the target's where that makes limits deeper; see `reduce`.
     keep_detected : bool, optional
         Subtract none of the light of detected companions with the star; True by default for real
         NIRCam frames, else False. Bright ones are part of the fit in any case, as in `reduce`.
         Undetected companions still lose light, as much as the throughput map says.
-    threshold : float, optional
-        S/N of a detected companion; see `reduce`.
-    disk : bool, optional
-        Fit extended light about the star together with it, see `fit_disk`, so that a disk is not
-        subtracted with the star. False by default.
-    star_flux : float, str or Quantity, optional
-        Flux density of the star in the filter, to which contrasts then refer; see `reduce`.
-    star_flux_error : float, optional
-        Its relative error.
-    image : {"cleaned", "flux", "subtracted"}, optional
+    image : {"cleaned", "subtracted"}, optional
         Image that the products carry. "subtracted", always that of forward models and the default
         but for real NIRCam frames, is each frame minus its star. "cleaned", the default for real
         NIRCam frames, is the posterior mean of the sky from all rolls together, see
         ``imaging.SkyModel``: sources are as sharp as in the frames but have no side lobes, which
         takes up to half of the light of a disk. Every frame has it on its own pixels, so that
-        pyKLIP's mean or median of the frames is the same image. "flux" has in each pixel the most
-        probable peak of a point source there, from all rolls together with the star marginalised:
-        its noise is that of the closed-form limits, and it keeps all light of a source. Pixels
-        beyond the fitted square have the frames minus star.
+        pyKLIP's mean or median of the frames is the same image. Pixels beyond the fitted square
+        have the frames minus star.
     max_chi2 : float, optional
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.
@@ -140,11 +107,9 @@ class DiffrenderSettings:
         A dataset that has been reduced. Those of the calls are copies of it to which faint sources
         were added; the star is not fitted to them again, but what it takes of the sources follows
         from the linear model of the fit. For contrast curves by injection.
-    files : path or sequence of path, optional
-        Files, or folders with the files, that a `JWSTData` was read from before `register`. The
-        errors and pixels of files in the current folder are found without it.
     threads : int, optional
         Number of threads of a reduction; PyTorch's choice by default. 1 is best on a busy machine.
+    (see the options)
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
@@ -167,7 +132,6 @@ class DiffrenderSettings:
     """
 
     opd: OPDLike | None = None
-    opd_folder: str | os.PathLike[str] | None = None
     model: Any = None
     filter: str | None = None
     pixelscale: float | tuple[float, float] | None = None
@@ -183,40 +147,31 @@ class DiffrenderSettings:
     disk: bool | None = None
     star_flux: float | str | u.Quantity | None = None
     star_flux_error: float | None = None
-    image: Literal["cleaned", "flux", "subtracted"] | None = None
+    image: Literal["cleaned", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None
-    files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None
     threads: int | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
         from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-        from pyklip_diffrender.pattern import as_request
-        from pyklip_diffrender.refinement import GaussNewton, to_jansky
+        from pyklip_diffrender.refinement import GaussNewton
 
-        # Alike for `reduce`. What is read from files is kept: settings are merged for every call.
-        for name, option in OPTIONS.items():
-            value = getattr(self, name, None)
-            if value is None or name == "start":
-                continue
-            if name == "star_flux":
-                to_jansky(value)
-            elif name == "systematics":
-                object.__setattr__(self, name, as_request(value))
-            else:
-                option.checked(value)
+        options = ReduceOptions(**self.given)
+        if self.systematics is not None:
+            # What is read from files is kept: settings are merged for every call.
+            object.__setattr__(self, "systematics", options.systematics)
         if self.fit_pixels is not None:
             replace(OPTIONS["size"], name="fit_pixels").checked(self.fit_pixels)
         choices = (
             ("image", self.image, IMAGES),
             ("keep_detected", self.keep_detected, (True, False)),
         )
-        for name, value, allowed in choices:
-            if value is not None and value not in allowed:
+        for name, chosen, allowed in choices:
+            if chosen is not None and chosen not in allowed:
                 raise IncompatibleSetupError(
-                    f"{name}: got {value!r}, expected one of {', '.join(map(str, allowed))}"
+                    f"{name}: got {chosen!r}, expected one of {', '.join(map(str, allowed))}"
                 )
         threads = self.threads
         if threads is not None and not (isinstance(threads, int) and threads >= 1):
@@ -240,6 +195,12 @@ class DiffrenderSettings:
                 f"{', '.join(sorted(known))}"
             )
 
+    @property
+    def given(self) -> dict[str, Any]:
+        """Options that are set here, of those that `reduce` has under the same name."""
+        values = {name: getattr(self, name, None) for name in OPTIONS}
+        return {name: value for name, value in values.items() if value is not None}
+
     def over(self, other: DiffrenderSettings) -> DiffrenderSettings:
         """Complete the settings by those of `other`."""
         merged: dict[str, Any] = {}
@@ -252,6 +213,15 @@ class DiffrenderSettings:
     def __deepcopy__(self, memo: dict[int, Any]) -> DiffrenderSettings:
         """Itself: it never changes, and a contrast curve copies its dataset 120 times."""
         return self
+
+
+DiffrenderSettings.__doc__ = inspect.cleandoc(DiffrenderSettings.__doc__ or "").replace(
+    "(see the options)",
+    "\n".join(
+        OPTIONS[name].entry
+        for name in ("start", "references", "threshold", "disk", "star_flux", "star_flux_error")
+    ),
+)
 
 
 def settings_of(dataset: Any) -> DiffrenderSettings:
@@ -307,19 +277,7 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
     DiffrenderWarning
         If the map is more than 200 days from the date.
     """
-    opd, folder = settings.opd, settings.opd_folder
-    if isinstance(opd, str) and opd in _RULES:
-        if folder is None:
-            raise MissingOPDError(
-                f"opd={opd!r} chooses a wavefront map by its date: give the folder with the maps "
-                "as opd_folder"
-            )
-        return _chosen(folder, date, _RULES[opd])
-    if opd is None and folder is not None:
-        return _chosen(folder, date, "nearest")
-    if isinstance(opd, str | os.PathLike) and opd != FLAT and Path(opd).is_dir():
-        return _chosen(opd, date, "nearest")
-    if opd is None:
+    if settings.opd is None:
         raise MissingOPDError(
             "algo='diffrender' starts from a measured wavefront map and none was given. Give a "
             "FITS file, an array in metres or a Quantity, in one of three ways: "
@@ -328,34 +286,4 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
             "closest in time to the observation, or give the folder with your maps; opd='flat' "
             "starts without one"
         )
-    if isinstance(opd, str | os.PathLike) and opd != FLAT:
-        path = Path(opd).resolve()
-        # A contrast curve reads the same map for each of its 120 reductions.
-        opd = _read(path, tuple(stamps([path]).items()))
-    return wavefront_for(opd, date)
-
-
-@lru_cache(maxsize=4)
-def _read(path: Path, version: tuple[Any, ...]) -> OPDMap:
-    """Read a map once for each version of its file."""
-    return as_opd_map(path)
-
-
-def _chosen(folder: str | os.PathLike[str], date: Time | None, rule: Rule) -> OPDMap:
-    """Choose a map from a folder."""
-    if date is None:
-        raise IncompatibleSetupError(
-            f"{folder} is a folder of wavefront maps, and the date of the frames is not known. "
-            "Make the JWSTData after register(), whose frames must have DATE-BEG in their header, "
-            "or give the file of the map as opd"
-        )
-    path = Path(folder).resolve()
-    # The time of the folder does not say whether one of its files was written again.
-    files = fits_files(path) if path.is_dir() else ()
-    return _choose_once(path, tuple(stamps(files).items()), date.isot, rule)
-
-
-@lru_cache(maxsize=4)
-def _choose_once(folder: Path, version: tuple[Any, ...], date: str, rule: Rule) -> OPDMap:
-    """Choose a map once for each state of the files in the folder."""
-    return choose_map(folder, date, rule)
+    return wavefront_for(settings.opd, date)

@@ -37,7 +37,6 @@ from pyklip_diffrender.pyklip_backend.source_frames import (
     Pointing,
     Recorded,
     SourceFrames,
-    attach_source,
     part_of,
     pointings_of,
     recorded_frames,
@@ -226,9 +225,8 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
     index = np.flatnonzero(np.asarray(dataset.wvs) == wavelength)
     if index.size == 0:
         raise IncompatibleSetupError(f"wavelength: got {wavelength}, the dataset has {wavelengths}")
-    imgs, settings = np.asarray(dataset.input)[index], settings_of(dataset)
-    attach_source(dataset, settings.files)
-    return _gather(dataset, index, imgs, settings).observation
+    imgs = np.asarray(dataset.input)[index]
+    return _gather(dataset, index, imgs, settings_of(dataset)).observation
 
 
 def date_of_frames(dataset: Any) -> Time | None:

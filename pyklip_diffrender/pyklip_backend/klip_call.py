@@ -61,7 +61,7 @@ from pyklip_diffrender.pyklip_backend.output_files import (
     throughput_map,
     write_throughput,
 )
-from pyklip_diffrender.pyklip_backend.source_frames import ATTRIBUTE, attach_source
+from pyklip_diffrender.pyklip_backend.source_frames import ATTRIBUTE, why_without_source
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.wavefront.opd import OPDMap
 
@@ -355,7 +355,6 @@ class DatasetReduction:
         """
         before, names = dict(vars(self.dataset)), self.dataset.filenames
         try:
-            attach_source(self.dataset, self.settings.files)
             self._check()
             opd = self._opd()
             folder, prefix = folder_and_prefix(
@@ -415,7 +414,13 @@ class DatasetReduction:
         before = self._before_injection
         if before:
             return before[0].opd
-        return starting_opd(self.settings, date_of_frames(self.dataset))
+        try:
+            return starting_opd(self.settings, date_of_frames(self.dataset))
+        except IncompatibleSetupError as error:
+            reason = why_without_source(self.dataset)
+            if reason is not None:
+                error.add_note(f"The date is not known, because {reason}")
+            raise
 
     @property
     def _before_injection(self) -> Sequence[ReductionRecord]:
@@ -543,8 +548,6 @@ class DatasetReduction:
         """Fraction of a faint source's peak that the products have, on the first frame's pixels."""
         if record.image == "cleaned":
             return record.images.sky.throughput()
-        if record.image == "flux":
-            return np.ones(result.frames[0].grid.shape[:2])  # It is marginalised over the star.
         return throughput_map(result)
 
     def _image(self, subtraction: Subtraction) -> str:
@@ -605,7 +608,7 @@ class DatasetReduction:
             # The model of the sky is that of the fit, also for copies with added sources.
             original = before[len(self.records)] if before else record
             added = frames.data - original.frames.data if before else None
-            original.images.put_into(residuals, image, added)
+            original.images.put_into(residuals, added)
         self.records.append(record)
         # The fit has the unit of the files; whoever multiplied the dataset gets it multiplied.
         residuals *= frames.factor[:, np.newaxis, np.newaxis]

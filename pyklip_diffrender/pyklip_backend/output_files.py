@@ -32,12 +32,11 @@ from pyklip_diffrender.wavefront.opd import OPDMap
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from pyklip_diffrender.detection.candidates import Maps
     from pyklip_diffrender.detection.templates import Templates
     from pyklip_diffrender.imaging import SkyModel
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
-    from pyklip_diffrender.refinement import FrameFit, Refinement
+    from pyklip_diffrender.refinement import Refinement
 
 __all__ = [
     "ProductImages",
@@ -95,18 +94,9 @@ class ProductImages:
 
         return SkyModel(self.fits)
 
-    @cached_property
-    def maps(self) -> Maps:
-        """Inner products of the data with planets."""
-        from pyklip_diffrender.detection.candidates import Maps
-        from pyklip_diffrender.detection.templates import groups_of
-
-        return Maps(groups_of(self.fits))
-
-    @cached_property
-    def _peaks(self) -> Image:
+    def _peaks(self, templates: Templates) -> Image:
         """Peaks of planets of contrast 1 at the pixels of the first frame, (ny, nx)."""
-        templates, shape = self.maps.groups[0][1], self.maps.shape
+        shape = templates.grid.shape[:2]
         rows, columns = (axis.ravel() for axis in np.indices(shape))
         peaks = []
         for start in range(0, len(rows), _IMAGES_AT_ONCE):
@@ -125,27 +115,27 @@ class ProductImages:
         disk = self._disk
         if disk is None or not len(disk.offsets):
             return None
+        # Takes a second to import.
+        from pyklip_diffrender.detection.templates import groups_of
+
+        _, templates = groups_of(self.fits)[0]
         angle = self.fits[0].frames[0].observation.position_angle
         # A point of the disk of contrast c has c times the peak of a planet of contrast 1 at the
         # nearest pixel; the estimate of the sky makes its image from that peak.
-        away = disk.offsets[:, None] - self.maps.grid.reshape(-1, 2)
+        away = disk.offsets[:, None] - templates.grid.reshape(-1, 2)
         pixels = np.hypot(*np.moveaxis(away, -1, 0)).argmin(axis=1)
-        peaks = disk.contrasts * self._peaks.ravel()[pixels]
+        peaks = disk.contrasts * self._peaks(templates).ravel()[pixels]
         return self.sky.of_sources(disk.offsets, peaks, angle)
 
-    def put_into(self, residuals: Image, image: str, added: Image | None = None) -> None:
-        """Replace the fitted square of frames minus star (n, Ny, Nx) by an image of the sky.
+    def put_into(self, residuals: Image, added: Image | None = None) -> None:
+        """Replace the fitted square of frames minus star (n, Ny, Nx) by the image of the sky.
 
         It is done in place. `added` is the light, (n, Ny, Nx), in copies of the frames that those
         of the fit do not have.
         """
-        sky = self._cleaned(added) if image == "cleaned" else self._flux(added)
+        sky = self._cleaned(added)
         for part in self.pointings:
-            fit = part.result
-            if image == "cleaned":
-                in_frame = self.sky.in_frame(sky, self.fits.index(fit), part.index)
-            else:
-                in_frame = self._on_frame(sky, fit.frames[part.index])
+            in_frame = self.sky.in_frame(sky, self.fits.index(part.result), part.index)
             pasted = part.paste(in_frame, part.window)
             frames = residuals[part.pointing.frames]
             # Pixels without a value have none in the image either.
@@ -171,33 +161,6 @@ class ProductImages:
                     images[k] = images[k] + image
         rest = np.asarray(self.sky.estimate(light)[0])
         return rest if self._extended is None else rest + self._extended
-
-    def _flux(self, added: Image | None) -> Image:
-        """Peak of a point source at each pixel of the first frame, with the star marginalised."""
-        numerator = self.maps.numerator
-        if added is not None:
-            # Contrast = numerator / information, the inner products of a planet's image with data
-            # and with itself after the star is marginalised; the first is linear in light that is
-            # added.
-            numerator = numerator + self.maps.change(self._added(added))[0]
-        known = self.maps.information > 0
-        contrast = np.divide(
-            numerator, self.maps.information, out=np.zeros_like(numerator), where=known
-        )
-        peaks = np.asarray(contrast * self._peaks)
-        if self._extended is None:
-            return peaks
-        return peaks + self.sky.in_frame(self._extended, 0, min(self.maps.groups[0][1].frames))
-
-    def _on_frame(self, flux: Image, frame: FrameFit) -> Image:
-        """A map of the first frame on the pixels of a frame."""
-        from pyklip_diffrender.detection.field import pixels_of
-        from pyklip_diffrender.imaging import interpolation_matrix
-
-        first = self.maps.groups[0][1].origin
-        offsets = first.observation.turned(frame.grid.reshape(-1, 2), frame.observation)
-        matrix = interpolation_matrix(pixels_of(first.grid, offsets), flux.shape)
-        return np.asarray(matrix @ flux.ravel()).reshape(frame.grid.shape[:2])
 
 
 # How much of a faint point source's light the subtraction leaves, from the linear model of a fit.

@@ -1,20 +1,16 @@
-"""Replace what a function or method of pyKLIP does, in place, and restore it exactly.
-
-Processes that are spawned meanwhile are told that plain KLIP would run in them.
-"""
+"""Replace what a function or method of pyKLIP does, in place, and restore it exactly."""
 
 from __future__ import annotations
 
 import inspect
 import logging
-import os
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["PatchedFunction", "PatchedMethod", "announce", "spawned_beside_klip"]
+__all__ = ["PatchedFunction", "PatchedMethod"]
 
 logger = logging.getLogger(__name__)
 
@@ -99,24 +95,3 @@ class PatchedMethod:
             logger.warning("%s was changed by another package meanwhile", self._name)
             return
         setattr(self._owner, self._name, self._original)
-
-
-# Spawned processes. They start with pyKLIP as it is, and would run KLIP without a word where their
-# parent takes calls with ``algo="klip"``. The environment, which they inherit, says so to whatever
-# they load of this package: the script that imports it, or a dataset that was read with it.
-
-_VARIABLE = "PYKLIP_DIFFRENDER_TAKES_KLIP"
-"""Environment variable with the number of the process that takes calls with ``algo="klip"``."""
-
-
-def announce(takes_klip: bool) -> None:
-    """Tell processes that are spawned from now on whether this one takes calls of KLIP."""
-    if takes_klip:
-        os.environ[_VARIABLE] = str(os.getpid())
-    elif os.environ.get(_VARIABLE) == str(os.getpid()):
-        del os.environ[_VARIABLE]
-
-
-def spawned_beside_klip() -> bool:
-    """Whether this process was started by one that takes calls of KLIP."""
-    return os.environ.get(_VARIABLE, str(os.getpid())) != str(os.getpid())

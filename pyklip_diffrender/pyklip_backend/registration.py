@@ -8,7 +8,7 @@ import os
 import threading
 import warnings
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Protocol
@@ -26,18 +26,12 @@ from pyklip_diffrender.pyklip_backend.klip_call import (
     mark_filtered,
 )
 from pyklip_diffrender.pyklip_backend.output_files import ReductionRecord
-from pyklip_diffrender.pyklip_backend.patch import (
-    PatchedFunction,
-    PatchedMethod,
-    announce,
-    spawned_beside_klip,
-)
+from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 from pyklip_diffrender.pyklip_backend.source_frames import keeping_references, keeping_source
 
 __all__ = [
     "ALGORITHM",
     "BLOCK",
-    "BOTH",
     "REGISTRY",
     "Patched",
     "Patches",
@@ -46,7 +40,6 @@ __all__ = [
     "dispatch_fm",
     "is_ours",
     "is_registered",
-    "name_of",
     "reduce_jwst_files",
     "register",
     "settings_for",
@@ -59,9 +52,6 @@ __all__ = [
 
 ALGORITHM = "diffrender"
 """Value of the argument `algo` of `klip_dataset`."""
-
-BOTH = f"{ALGORITHM}+klip"
-"""Name of the algorithm that writes KLIP's products beside those of this backend."""
 
 
 class Patched(Protocol):
@@ -83,11 +73,8 @@ class Registry:
         # None while nobody uses the backend.
         self.patches: Patched | None = None
         self.registered = False
-        # Number of `backend` blocks in all threads, and of those that take over KLIP.
+        # Number of `backend` blocks in all threads.
         self.blocks = 0
-        self.forcing = 0
-        # Whether plain KLIP is mentioned, in a spawned process.
-        self.watching = False
         self.defaults = DiffrenderSettings()
         # Whether `register` was told to take over KLIP; None if it was told nothing.
         self.replace: bool | None = None
@@ -95,9 +82,8 @@ class Registry:
 
 REGISTRY = Registry()
 
-_NO_BLOCK = (DiffrenderSettings(), None)
 BLOCK: ContextVar[tuple[DiffrenderSettings, bool | None]] = ContextVar(
-    "diffrender", default=_NO_BLOCK
+    "diffrender", default=(DiffrenderSettings(), None)
 )
 """Settings of the enclosing `backend` blocks, and whether they take over KLIP; None without."""
 
@@ -111,34 +97,14 @@ def _takes_klip() -> bool | None:
     return REGISTRY.replace if force is None else force
 
 
-def name_of(algo: Any) -> str:
-    """The argument `algo` in lower case and without spaces."""
-    return "".join(str(algo).lower().split())
-
-
 def is_ours(algo: Any) -> bool:
     """Whether a call with this `algo` is for this backend."""
-    name = name_of(algo)
-    return name in (ALGORITHM, BOTH) or (name == "klip" and bool(_takes_klip()))
-
-
-def _outside_block() -> bool:
-    """Whether a `backend` block was entered, but in other threads only."""
-    return REGISTRY.blocks > 0 and BLOCK.get() is _NO_BLOCK
+    name = str(algo).lower()
+    return name == ALGORITHM or (name == "klip" and bool(_takes_klip()))
 
 
 def warn_of_klip(dataset: Any, function: str) -> None:
-    """Warn if KLIP runs where this backend may be expected."""
-    if _takes_klip() is None and (REGISTRY.watching or (REGISTRY.forcing and _outside_block())):
-        place = "spawned process" if REGISTRY.watching else "thread"
-        warnings.warn(
-            f"{function} runs KLIP in this {place}, to which the `with backend():` block or "
-            "register(replace=True) that another one has entered does not extend. Call "
-            f"register(replace=True, ...) or enter a block in the {place} itself",
-            DiffrenderWarning,
-            stacklevel=4,
-        )
-        return
+    """Warn if KLIP runs on a dataset that this backend has reduced."""
     records = getattr(dataset, RESULTS, ())
     if not records or records[0] in _warned or _takes_klip() is not None:
         return
@@ -155,13 +121,6 @@ def warn_of_klip(dataset: Any, function: str) -> None:
 def settings_for(dataset: Any) -> DiffrenderSettings:
     """Return the settings of the enclosing blocks, of the dataset and of `register`, merged."""
     settings, _ = BLOCK.get()
-    if _outside_block():
-        warnings.warn(
-            "settings of a `with backend():` block that another thread has entered do not hold in "
-            "this thread. Enter a block in the thread itself, or give the settings to register()",
-            DiffrenderWarning,
-            stacklevel=4,
-        )
     return settings.over(settings_of(dataset)).over(REGISTRY.defaults)
 
 
@@ -231,10 +190,7 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
     arguments = call.arguments
     if is_ours(arguments["algo"]):
         settings = settings_for(arguments["dataset"])
-        before = dict(vars(arguments["dataset"]))
         DatasetReduction(arguments, settings).run(klip_dataset.original)
-        if name_of(arguments["algo"]) == BOTH:
-            _run_klip(klip_dataset.original(), arguments, before)
     else:
         if str(arguments["algo"]).lower() == "klip":
             warn_of_klip(arguments["dataset"], "klip_dataset")
@@ -243,33 +199,9 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
         mark_filtered(arguments["dataset"])
 
 
-def _run_klip(
-    klip_dataset: Callable[..., None], arguments: Mapping[str, Any], before: Mapping[str, Any]
-) -> None:
-    """Write KLIP's products beside those of this backend, whose results stay in the dataset.
-
-    KLIP starts from the attributes that the dataset had `before` the call.
-    """
-    attributes = vars(arguments["dataset"])
-    after = dict(attributes)
-    attributes.clear()
-    attributes.update(before)
-    try:
-        prefix = f"{arguments['fileprefix']}-klip"
-        klip_dataset(**{**arguments, "algo": "klip", "fileprefix": prefix})
-    finally:
-        attributes.clear()
-        attributes.update(after)
-
-
 def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
     """Handle a call of `pyklip.fm.klip_dataset`, to which this package adds an argument `algo`."""
     klip_dataset = _patches().fm_klip_dataset
-    if name_of(kwargs.get("algo")) == BOTH:
-        raise IncompatibleSetupError(
-            f"algo: pyklip.fm.klip_dataset takes 'diffrender' or 'klip', not {BOTH!r}, because an "
-            "fm_class is for one of them. Call it twice"
-        )
     if not is_ours(kwargs.get("algo", "klip")):
         warn_of_klip(args[0] if args else kwargs.get("dataset"), "pyklip.fm.klip_dataset")
         return klip_dataset.original()(*args, **kwargs)
@@ -299,13 +231,12 @@ def _fm_klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
 # Make ``algo="diffrender"`` work in pyKLIP, permanently or in a block, and undo it exactly.
 
 
-def _use(registered: bool, blocks: int, forcing: int | None = None) -> None:
+def _use(registered: bool, blocks: int) -> None:
     """Set the users; patch pyKLIP for the first and restore it after the last.
 
-    `blocks` is the number of `backend` blocks in all threads, `forcing` of those that take over
-    KLIP.
+    `blocks` is the number of `backend` blocks in all threads.
     """
-    in_use = registered or blocks > 0 or REGISTRY.watching
+    in_use = registered or blocks > 0
     if in_use and REGISTRY.patches is None:
         patches = Patches()
         patches.apply()
@@ -314,8 +245,6 @@ def _use(registered: bool, blocks: int, forcing: int | None = None) -> None:
         REGISTRY.patches.restore()
         REGISTRY.patches = None
     REGISTRY.registered, REGISTRY.blocks = registered, blocks
-    REGISTRY.forcing = REGISTRY.forcing if forcing is None else forcing
-    announce(REGISTRY.forcing > 0 or bool(REGISTRY.replace))
 
 
 def is_registered() -> bool:
@@ -393,8 +322,9 @@ def backend(
 ) -> Iterator[None]:
     """Use this backend within a block, without changing the code that is called there.
 
-    The block holds for the thread that enters it, and for processes that are forked in it. Calls in
-    other threads and in spawned processes run KLIP with a warning.
+    The block holds for the thread that enters it, and for processes that are forked in it. In other
+    threads and in spawned processes, ``algo="klip"`` remains KLIP; call `register` with
+    ``replace=True`` there.
 
     Parameters
     ----------
@@ -423,21 +353,14 @@ def backend(
     outer, _ = BLOCK.get()
     settings = DiffrenderSettings(opd=opd, model=model, **options).over(outer)
     with REGISTRY.lock:
-        _use(REGISTRY.registered, REGISTRY.blocks + 1, REGISTRY.forcing + int(bool(force)))
+        _use(REGISTRY.registered, REGISTRY.blocks + 1)
     token = BLOCK.set((settings, force))
     try:
         yield
     finally:
         BLOCK.reset(token)
         with REGISTRY.lock:
-            _use(REGISTRY.registered, REGISTRY.blocks - 1, REGISTRY.forcing - int(bool(force)))
-
-
-if spawned_beside_klip():
-    # So that plain KLIP is mentioned, in a spawned process.
-    with REGISTRY.lock:
-        REGISTRY.watching = True
-        _use(REGISTRY.registered, REGISTRY.blocks)
+            _use(REGISTRY.registered, REGISTRY.blocks - 1)
 
 
 # A reduction of JWST files by `klip_dataset` in one call.

@@ -3,8 +3,7 @@
 `JWSTData.readdata` keeps the base name of each file and frames that a cubic spline has shifted to
 the centre of the array. A wavefront fit needs the pixels as the detector recorded them, with their
 errors. While the backend is registered, reading a dataset also attaches a `SourceFrames` to it, and
-reading its library of reference stars attaches the paths of their files. A dataset that was read
-before gets its `SourceFrames` from the files, if these can be found. Frames of one place and
+reading its library of reference stars attaches the paths of their files. Frames of one place and
 orientation are a `Pointing`.
 """
 
@@ -45,7 +44,6 @@ __all__ = [
     "Pointing",
     "Recorded",
     "SourceFrames",
-    "attach_source",
     "judged_before",
     "keeping_references",
     "keeping_source",
@@ -150,85 +148,36 @@ def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
     return readdata_and_source
 
 
-def attach_source(dataset: Any, files: Any = None) -> None:
-    """Attach a `SourceFrames` to a `JWSTData` that was read before `register`, if possible.
-
-    Its files are looked for by name in `files` (files or folders) and in the current folder.
-    """
-    if hasattr(dataset, ATTRIBUTE) or hasattr(dataset, REASON) or not _reads_files(dataset):
-        return
-    several = [files] if isinstance(files, str | os.PathLike) else list(files or ())
-    known: dict[str, str] = {}
-    for path in [Path(), *map(Path, several)]:
-        inside = path.iterdir() if path.is_dir() else [path]
-        known |= {each.name: str(each) for each in inside}
-    # pyKLIP appends the number of the integration to the name of the file.
-    names = list(dict.fromkeys(str(each).rpartition("_INT")[0] for each in dataset.filenames))
-    missing = [name for name in names if name not in known]
-    if missing:
-        return
-    try:
-        setattr(dataset, ATTRIBUTE, read_source(dataset, [known[n] for n in names], late=True))
-    except (KeyError, ValueError, OSError) as error:
-        setattr(dataset, REASON, str(error))
-    else:
-        _log.info("the files of the dataset were read again: it was made before register()")
-
-
 def why_without_source(dataset: Any) -> str | None:
     """Return why errors and original pixels of a dataset's files are not known.
 
     None for a dataset that has them, or was not read from files.
     """
-    if hasattr(dataset, ATTRIBUTE) or not _reads_files(dataset):
+    # Attributes of a `JWSTData`, which has read files.
+    reads_files = hasattr(dataset, "center_include_offset") and hasattr(dataset, "center_kw_x")
+    if hasattr(dataset, ATTRIBUTE) or not reads_files:
         return None
-    reason = getattr(dataset, REASON, None)
-    if reason is not None:
-        return str(reason)
-    return (
-        "the dataset was made before register() or the backend block. Make it after that, or say "
-        "where its files are: DiffrenderSettings(files=...)"
-    )
+    made_before = "the dataset was made before register() or the backend block. Make it after that"
+    return str(getattr(dataset, REASON, made_before))
 
 
-def _reads_files(dataset: Any) -> bool:
-    """Whether a dataset is a `JWSTData`, which has read files."""
-    return hasattr(dataset, "center_include_offset") and hasattr(dataset, "center_kw_x")
-
-
-def read_source(
-    dataset: Any, filepaths: str | Iterable[str], *, late: bool = False
-) -> SourceFrames:
+def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
     """Read the pixels, errors, flags and headers of the files of a `JWSTData`.
 
-    With `late` its frames may have been changed, left out or reordered since it was read, so that
-    all are shifted again. Raises ValueError if shifting as pyKLIP does not give ``dataset.input``.
+    Raises ValueError if shifting the first frame as pyKLIP does not give that of ``dataset.input``.
     """
     from pyklip.klip import align_and_scale
 
     paths = [filepaths] if isinstance(filepaths, str) else list(filepaths)
     files: list[_File] = []
-    shifted: list[NDArray[np.float32]] = []
-    middle = np.zeros(2)
+    first = np.empty(0)
     for path in paths:
         file, as_read, center = _read(path, dataset)
         if not files:
             middle = (np.array(as_read.shape[:0:-1]) - 1) / 2.0
-        for frame in as_read if late else as_read[: 0 if files else 1]:
-            moved = align_and_scale(frame, new_center=middle, old_center=center)
-            shifted.append(np.asarray(moved, dtype=np.float32))
+            first = align_and_scale(as_read[0], new_center=middle, old_center=center)
         files.append(file)
     counts = [len(file.data) for file in files]
-    aligned, centers = np.array(dataset.input), np.array(dataset.centers)
-    names = tuple(str(name) for name in dataset.filenames)
-    if late:
-        aligned = np.array(shifted)
-        centers = np.tile(middle, (len(aligned), 1))
-        names = tuple(
-            f"{Path(path).name}_INT{k + 1}"
-            for path, n in zip(paths, counts, strict=True)
-            for k in range(n)
-        )
     judged = _JUDGED.get()
     source = SourceFrames(
         headers=[file.header for file, n in zip(files, counts, strict=True) for _ in range(n)],
@@ -238,19 +187,18 @@ def read_source(
         else _joined([file.error for file in files if file.error is not None]),
         usable=_joined([file.usable for file in files]),
         centers=np.concatenate([file.centers for file in files]),
-        aligned=aligned,
-        aligned_centers=centers,
-        filenames=names,
+        aligned=np.array(dataset.input),
+        aligned_centers=np.array(dataset.centers),
+        filenames=tuple(str(name) for name in dataset.filenames),
         first_pixels=[f.first_pixel for f, n in zip(files, counts, strict=True) for _ in range(n)],
         star_offsets=[f.star_offset for f, n in zip(files, counts, strict=True) for _ in range(n)],
         paths=[f.file.path for f, n in zip(files, counts, strict=True) for _ in range(n)],
         files={each.file.path: each.file for each in files},
         sequence=None if judged is None else judged.sequence,
     )
-    if not late:
-        same_shape = source.data.shape == aligned.shape
-        if not same_shape or not _is_close(shifted[0], aligned[0]):
-            raise ValueError(f"{paths[0]}: pyKLIP shifted these frames in a way not known here")
+    same_shape = source.data.shape == source.aligned.shape
+    if not same_shape or not _is_close(first, source.aligned[0]):
+        raise ValueError(f"{paths[0]}: pyKLIP shifted these frames in a way not known here")
     return source
 
 

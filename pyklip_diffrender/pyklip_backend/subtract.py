@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.progress import heard_by
-from pyklip_diffrender.options import OPTIONS, ReduceOptions
+from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.fitted_star import (
     Fit,
@@ -150,12 +150,11 @@ def _options(
     """Options of the reduction; the settings that are None are those of `reduce`."""
     from pyklip_diffrender.reduction.pipeline import MAX_CHI2
 
-    given = {name: getattr(settings, name, None) for name in OPTIONS}
-    given["settings"] = settings.fit
-    given["systematics"] = _requested_pattern(settings, observation, references)
-    if given["max_chi2"] is None:
-        given["max_chi2"] = MAX_CHI2
-    return ReduceOptions(**{key: value for key, value in given.items() if value is not None})
+    own = {
+        "settings": settings.fit,
+        "systematics": _requested_pattern(settings, observation, references),
+    }
+    return ReduceOptions(**{"max_chi2": MAX_CHI2, **settings.given, **own})
 
 
 def _requested_pattern(

@@ -24,7 +24,6 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.headers import file_name
-from pyklip_diffrender.options import ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.pyklip_backend.source_frames import JudgedFiles, OpenedFile, judged_before
@@ -68,10 +67,8 @@ def run_obs(
     opd: Any,
     restrict_to: str | None = None,
     subdir: str = "diffrender",
-    threshold: float = ReduceOptions.threshold,
     save_rolls: bool = False,
     star_flux: Mapping[str, float | str | u.Quantity] | None = None,
-    star_flux_error: float = ReduceOptions.star_flux_error,
     spectra: abc.Sequence[str] = SPECTRA,
     verbose: bool = False,
     **settings: Any,
@@ -112,22 +109,19 @@ def run_obs(
         Only concatenations whose name contains this.
     subdir : str
         Folder of the products in ``database.output_dir``.
-    threshold : float
-        S/N of a candidate.
     save_rolls : bool
         Also write the subtracted image of each file, with `_roll1` and so on after its name.
     star_flux : mapping of str to float, str or Quantity, optional
         Flux density of the star by filter, such as ``{"F444W": "0.45 Jy"}``, to which contrasts
         then refer; see `pyklip_diffrender.reduce`. Without it, or in other filters, the diffracted
         light determines it. The subtracted images hardly change.
-    star_flux_error : float
-        Relative error of these, with that of the photometric calibration.
     spectra : sequence of str
         Spectra of planets for the search over concatenations; see `pyklip_diffrender.combine`.
     verbose : bool
         Print what is being done.
     **settings
-        Other fields of `DiffrenderSettings`, such as `systematics`.
+        Other fields of `DiffrenderSettings`, such as `systematics`, `threshold` and
+        `star_flux_error`.
 
     Returns
     -------
@@ -161,7 +155,7 @@ def run_obs(
     """
     fluxes = _fluxes(star_flux or {}, database)
     # What is wrong in them is said before the first file is read.
-    common = {"opd": opd, "threshold": threshold, "star_flux_error": star_flux_error, **settings}
+    common = {"opd": opd, **settings}
     DiffrenderSettings(**common)
     folder = Path(database.output_dir) / subdir
     folder.mkdir(parents=True, exist_ok=True)
