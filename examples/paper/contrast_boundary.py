@@ -92,7 +92,7 @@ def one_seed(setup: Setting, places: tuple[float, ...], steps: int, seed: int) -
     shot = frame(setup, HOURS, seed)
     frames = references(setup, HOURS, seed)
     empty = all_of(setup, shot, frames, steps)
-    curve = dr.contrast_curve(empty["Gauss-Newton"].fit, places, angles=60)
+    curve = dr.detect(empty["Gauss-Newton"].fit, separations=places).contrast_curve
     closed = {round(float(row["separation"].value), 3): row for row in curve}
     rows = []
     # Neighbours in separation are in different frames, and on other sides of the star.

@@ -116,7 +116,7 @@ def one_frame(
     if steps:
         subtracted["Adam, held"] = adam(setup, shot, steps)
     assert fitted.fit is not None
-    planet = dr.measure(fitted.fit, [PLANET.offset])[0]
+    planet = dr.detect(fitted.fit).measure([PLANET.offset])[0]
     rows = []
     for name, result in subtracted.items():
         rows.append(
