@@ -264,8 +264,13 @@ class Picture:
 
     name: str  # of its file, without the ending
     figure: Any  # of matplotlib
-    alt: str  # description of the picture, for readers who do not see it
-    caption: str
+    description: str  # a sentence, also for readers who do not see the picture
+    details: str = ""  # further sentences of the caption
+
+    @property
+    def caption(self) -> str:
+        """The description with the details."""
+        return f"{self.description} {self.details}".rstrip()
 
     @cached_property
     def uri(self) -> str:
