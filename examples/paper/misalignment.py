@@ -23,10 +23,9 @@ from astropy.table import Table
 from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).parent))
-from judging import COLOURS, pixel, select, spread, star_error
+from judging import COLOURS, pixel, psnr, select, spread, star_error
 from methods import (
     QUICK,
     STEPS,

@@ -38,7 +38,6 @@ from pyklip_diffrender.detection.search_result import Detection, draw_curve
 from pyklip_diffrender.detection.whole_frame import EDGE, REACH, WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.refinement import star_flux_error
@@ -112,13 +111,6 @@ class WideField:
     def __str__(self) -> str:
         """The candidates in words, at most 80 columns wide."""
         return in_words(self.candidates, self.threshold)
-
-    def _repr_html_(self) -> str:
-        ny, nx = self.snr.shape
-        facts = {"Star": self.observation.target, "Pixels": f"{nx} x {ny}"}
-        title = f"WideField: {len(self.candidates)} candidates above {self.threshold:g} sigma"
-        columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "shape")
-        return html_summary(title, facts, self.candidates, columns)
 
     @property
     def observation(self) -> Observation:
