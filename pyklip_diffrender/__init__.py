@@ -21,10 +21,8 @@ if TYPE_CHECKING:
         WideField,
         combine,
         completeness,
-        contrast_curve,
         detect,
         fit_disk,
-        measure,
         wide_field,
     )
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
@@ -87,7 +85,6 @@ __all__ = [
     "combine",
     "combine_libraries",
     "completeness",
-    "contrast_curve",
     "detect",
     "fetch_calints",
     "fit_disk",
@@ -98,7 +95,6 @@ __all__ = [
     "learn_prior",
     "learn_systematics",
     "list_calints",
-    "measure",
     "model_for",
     "nircam_coronagraph",
     "observation_from_dataset",
@@ -117,8 +113,8 @@ __all__ = [
 _NAMES = {
     "archive": "fetch_calints list_calints",
     "bridges": "from_poppy from_webbpsf",
-    "detection": "Combination combine completeness contrast_curve detect Detection Disk fit_disk "
-    "measure wide_field WideField",
+    "detection": "Combination combine completeness detect Detection Disk fit_disk "
+    "wide_field WideField",
     "instrument.nircam": "nircam_coronagraph",
     "instrument.spectrum": "star_flux_density",
     "linear.model": "LinearModel",

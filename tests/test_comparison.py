@@ -71,7 +71,7 @@ def test_the_page_shows_the_combined_search(tmp_path):
     assert "S/N" in row[title.index("Contrast in F444W")]
     assert "1 candidate\n" in in_words(combination)
     # The way of a source in the background is drawn for the candidate.
-    assert text.count("the way of a source in the background") == 1
+    assert text.count("by the dashed line. A companion stays") == 1
     assert [each["epoch_mjd"] for each in content["sightings"]] == [59855.0, 60280.0]
 
 

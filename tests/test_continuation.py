@@ -87,7 +87,7 @@ def test_every_way_a_fit_can_go_on(grown, count):
     assert len(fit.linear.vector) == len(fit.linear.unknowns)
     again = refine_again(fit, max_iterations=4)
     assert len(again.basis) == len(fit.basis)
-    assert len(dr.measure(fit, [[0.3, -0.5]])) == 1
+    assert len(dr.detect(fit).measure([[0.3, -0.5]])) == 1
 
 
 @pytest.mark.slow

@@ -178,10 +178,6 @@ def test_a_planet_does_not_make_the_noise_larger(world):
     # Its light would be structure that no mode explains.
     assert fit.reduced_chi2 > 1.06 * quiet.reduced_chi2
     assert found.scatter == pytest.approx(noise.scatter, rel=0.01)
-    # The same where positions are given, once or more often.
-    once, thrice = (dr.measure(fit, [WHERE.offset] * count) for count in (1, 3))
-    assert found.measure([WHERE.offset])["snr"] == pytest.approx(once["snr"], rel=0.01)
-    assert thrice["snr"].tolist() == pytest.approx([once["snr"][0]] * 3, rel=1e-4)
 
 
 def test_weights_for_outliers_do_not_hide_structure(world):
@@ -234,7 +230,8 @@ def own_error(found):
 def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world):
     """A contrast is relative to the star's light; whether there is a source at all is not."""
     fit = world.fitted(5, FAINT)
-    row, scaled = (dr.measure(fit, [WHERE.offset], scatter=factor)[0] for factor in (1.0, 2.0))
+    found = (dr.detect(fit, scatter=factor, relinearise=math.inf) for factor in (1.0, 2.0))
+    row, scaled = (each.measure([WHERE.offset])[0] for each in found)
     relative = fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
     assert 1e-4 < relative < 0.05
     expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
@@ -336,10 +333,12 @@ def test_a_fit_that_is_gone_holds_no_memory(large):
 @pytest.mark.slow
 def test_independent_looks_add_their_information(world):
     fits = [world.fitted(seed, FAINT) for seed in (5, 20, 21)]
-    single = [float(dr.measure(fit, [WHERE.offset])["contrast_error"][0]) for fit in fits]
-    (joint,) = dr.measure(fits, [WHERE.offset])
+    single, (joint,) = (
+        [row for part in looks for row in dr.detect(part).measure([WHERE.offset])]
+        for looks in (fits, [fits])
+    )
     # Of the errors' excess over the noise, which is taken from all together, 4 % are known.
-    expected = np.sum(np.array(single) ** -2.0) ** -0.5
+    expected = np.sum([each["contrast_error"] ** -2.0 for each in single]) ** -0.5
     assert joint["contrast_error"] == pytest.approx(expected, rel=0.04)
     assert abs(joint["contrast"] - FAINT.contrast) < 4 * joint["contrast_error"]
 
@@ -356,11 +355,12 @@ def test_rolled_frames_share_the_star_and_turn_the_planet(world):
     apart = [world.fitted(5, FAINT), world.refined(frames[1])]
     # The frame of the first one is as it would be without an angle: the angles' difference counts.
     apart[0] = replace(apart[0], frames=(replace(apart[0].frames[0], observation=frames[0]),))
-    joint, separate = (dr.measure(each, [FAINT.offset])[0] for each in (together, apart))
+    found = dr.detect(together)
+    joint, separate = (each.measure([FAINT.offset])[0] for each in (found, dr.detect(apart)))
     for row in (joint, separate):
         assert abs(row["contrast"] - FAINT.contrast) < 4 * row["contrast_error"]
     assert joint["contrast_error"] < separate["contrast_error"]
-    (wrong,) = dr.measure(together, [replace(FAINT, position_angle=70.0).offset])
+    (wrong,) = found.measure([replace(FAINT, position_angle=70.0).offset])
     assert wrong["snr"] < 0.6 * joint["snr"]
 
 
@@ -370,7 +370,7 @@ def test_side_lobes_do_not_hide_their_source(world, monkeypatch, rolls, left, co
     frames = [world.observed(world.expected(FAINT.rotated(-a)), 5, position_angles=np.array([a]))
               for a in (0.0, 10.0)[:rolls]]  # fmt: skip
     fit = world.refined(frames)
-    high = dr.measure(fit, [FAINT.offset])[0]["snr"] / 4.5
+    high = dr.detect(fit, scatter=1.0).measure([FAINT.offset])[0]["snr"] / 4.5
     monkeypatch.setattr(Significance, "factor", lambda self, snr, sources: ErrorFactor.constant(
         left if len(sources) else high))  # fmt: skip
     assert len(dr.detect(fit).candidates) == count
@@ -380,7 +380,8 @@ def test_a_reference_star_helps_and_shows_no_planet(world):
     target = world.observed(world.expected(FAINT), 5)
     reference = replace(world.observed(4 * world.expected(), 41), reference=True)
     fit = world.refined([target, reference])
-    alone, both = (dr.measure(each, [FAINT.offset])[0] for each in (world.fitted(5, FAINT), fit))
+    found = (world.detected(5, FAINT), dr.detect(fit))
+    alone, both = (each.measure([FAINT.offset])[0] for each in found)
     assert abs(both["contrast"] - FAINT.contrast) < 4 * both["contrast_error"]
     assert both["contrast_error"] < 0.99 * alone["contrast_error"]
     with pytest.raises(IncompatibleSetupError, match="reference star"):
@@ -423,13 +424,11 @@ def test_the_contrast_curve_is_five_times_the_error_of_the_map(world):
     assert (table["contrast"] > table["known_star"]).all()
     assert (table["lowest"] <= table["contrast"]).all()
     assert (table["highest"] >= table["contrast"]).all()
-    quick = dr.contrast_curve(world.fitted(0), separations=[0.5, 0.8], angles=200)
-    for row in quick:
-        k = int(np.argmin(np.abs(table["separation"] - row["separation"])))
-        assert row["contrast"] == pytest.approx(table["contrast"][k], rel=1e-6)
     # What is partly outside the field has rows for the part inside.
-    partly = dr.contrast_curve(world.fitted(0), [500.0, 5000.0] * u.mas)
+    partly = dr.detect(world.fitted(0), separations=[500.0, 5000.0] * u.mas).contrast_curve
     assert partly["separation"].to_value("arcsec").tolist() == [0.5]
+    k = int(np.argmin(np.abs(table["separation"] - partly["separation"][0])))
+    assert partly["contrast"][0] == pytest.approx(table["contrast"][k], rel=1e-6)
 
 
 def oriented(found):
@@ -611,16 +610,15 @@ def test_every_frame_is_subtracted_as_it_was_taken(large):
 def test_positions_may_have_a_unit_and_are_in_the_field(one):
     plain = one.measure([[-0.485, 0.353]])
     for offsets in ([[-485, 353]] * u.mas, [[-0.485, 0.353]] * u.arcsec):
-        for table in (one.measure(offsets), dr.measure(one.fits, offsets, scatter=one.scatter)):
-            for name in plain.colnames:
-                np.testing.assert_allclose(table[name], plain[name], rtol=1e-12)
+        table = one.measure(offsets)
+        for name in plain.colnames:
+            np.testing.assert_allclose(table[name], plain[name], rtol=1e-12)
     # Such as one that somebody else calls arcsec, and means degrees or pixels.
     corner = one.grid[0, 0]
     assert np.isfinite(one.measure([corner])["contrast"][0])
     for far in (1.1 * corner, [[0.7, 0.35]] * u.deg, [-30.0, 5.0]):
-        for measure in (one.measure, lambda offsets: dr.measure(one.fits, offsets)):
-            with pytest.raises(IncompatibleSetupError, match=r"offsets: got .*the star; .*u\.mas"):
-                measure(far)
+        with pytest.raises(IncompatibleSetupError, match=r"offsets: got .*the star; .*u\.mas"):
+            one.measure(far)
 
 
 @pytest.mark.parametrize(
@@ -628,18 +626,15 @@ def test_positions_may_have_a_unit_and_are_in_the_field(one):
     [
         (lambda fit: dr.detect([]), "no fit"),
         (lambda fit: dr.detect(replace(fit, stored_linear=None)), "linear=False.*Fit the fra"),
-        (lambda fit: dr.measure(fit, [0.1, 0.2, 0.3]), r"\(k, 2\)"),
-        (lambda fit: dr.measure(fit, [[np.nan, 0.2]]), "offsets"),
-        (lambda fit: dr.measure(fit, [[1.0, 2.0]] * u.m), "offsets"),
-        (lambda fit: dr.measure(fit, [[0.5, 0.5]], scatter=math.nan), "scatter: got.*positive"),
+        (lambda fit: dr.detect(fit).measure([0.1, 0.2, 0.3]), r"\(k, 2\)"),
+        (lambda fit: dr.detect(fit).measure([[np.nan, 0.2]]), "offsets"),
+        (lambda fit: dr.detect(fit).measure([[1.0, 2.0]] * u.m), "offsets"),
         (lambda fit: dr.detect(fit, inner=1 * u.m), "inner"),
         (lambda fit: dr.detect(fit, inner=-1.0), "inner: got.*positive"),
         (lambda fit: dr.detect(fit, threshold=0.0), "threshold: got.*positive"),
         (lambda fit: dr.detect(fit, scatter=math.nan), "scatter: got.*positive"),
         (lambda fit: dr.detect(fit, separations=[0.5, -1.0]), "separations: got.*positive"),
-        (lambda fit: dr.contrast_curve(fit, [math.nan]), "separations: got.*positive"),
-        (lambda fit: dr.contrast_curve(fit, [0.5], scatter=0.0), "scatter: got.*positive"),
-        (lambda fit: dr.contrast_curve(fit, [5.0, 6.0]), r"separations: got \[5\.0, 6\.0\].*corn"),
+        (lambda fit: dr.detect(fit, separations=[math.nan]), "separations: got.*positive"),
     ],
 )
 def test_what_cannot_be_searched_or_measured_is_refused(one, call, words):
@@ -669,11 +664,9 @@ def test_all_errors_have_the_factor_of_their_position(world):
     # Noise in units of measured errors follows Student's t.
     assert (curve["small_sample"] > 1.05 * curve["contrast"]).all()
     np.testing.assert_allclose(limits["small_sample"], limits["contrast"])
-    # The functions for a few positions multiply their errors likewise.
+    # Errors at a few positions are multiplied likewise.
     offsets = np.array([[0.3, 0.1], [0.0, -0.8]])
     known = plain.measure(offsets)
-    for table in (found.measure(offsets), dr.measure(mismatch, offsets)):
-        ratio = table["contrast"] / table["snr"] * known["snr"] / known["contrast"]
-        np.testing.assert_allclose(ratio, factor.of(offsets), rtol=1e-6)
-    again = dr.contrast_curve(mismatch, curve["separation"])
-    np.testing.assert_allclose(again["contrast"], curve["contrast"], rtol=1e-6)
+    table = found.measure(offsets)
+    ratio = table["contrast"] / table["snr"] * known["snr"] / known["contrast"]
+    np.testing.assert_allclose(ratio, factor.of(offsets), rtol=1e-6)

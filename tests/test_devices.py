@@ -87,8 +87,8 @@ def search(device, frames, **model):
     return [
         *reached(fit),
         *np.asarray(detection.candidates["contrast"]),
-        *np.asarray(dr.measure(fit, [PLANET.offset])["contrast"]),
-        *np.asarray(dr.contrast_curve(fit)["contrast"]),
+        *np.asarray(detection.measure([PLANET.offset])["contrast"]),
+        *np.asarray(detection.contrast_curve["contrast"]),
         float(np.nanstd(detection.subtracted[0])),
     ]
 

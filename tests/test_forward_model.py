@@ -14,7 +14,7 @@ from pyklip.fmlib.nofm import NoFM
 from pyklip.klip import rotate
 from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender.detection import detect, measure
+from pyklip_diffrender.detection import detect
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
@@ -170,7 +170,7 @@ def test_the_products_say_what_the_fit_knows_of_the_planet(model, tmp_path):
         assert header["DRFMFLUX"] == pytest.approx(1 / 1.3, rel=0.02)
         assert header["DRFMRA"] == pytest.approx(SEPARATION * np.sin(direction), abs=0.01)
         assert header["DRFMDE"] == pytest.approx(SEPARATION * np.cos(direction), abs=0.01)
-        snr = measure(result, [place(ANGLES[0], flipx=True)])["snr"][0]
+        snr = detect(result).measure([place(ANGLES[0], flipx=True)])["snr"][0]
         # Position and flux are independent of each other to first order.
         assert header["DRFMFLUX"] / header["DRFMFERR"] == pytest.approx(snr, rel=0.1)
         assert 1 / snr < header["DRFMRAER"] < 3 / snr

@@ -296,7 +296,7 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
         assert (attributes["src"] or "").startswith("data:image/png;base64,")
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
     assert all((a.get("src") or "data:").startswith("data:") for _, a in page.tags)
-    picture = pages.Picture("", drawing.panel()[0], "", "")
+    picture = pages.Picture("", drawing.panel()[0], "")
     assert picture.uri.startswith("data:image/png;base64,iVBOR")
     # Links are to the files beside it.
     linked = {a["href"] for _, a in page.tags if "href" in a}
@@ -519,7 +519,7 @@ def test_every_figure_is_a_file_of_its_own(tmp_path):
 
 
 def shown():
-    """Everything with a summary in HTML, of frames with a hostile header and name."""
+    """Objects that notebooks show, of frames with a hostile header and name."""
     whole = reduction()
     header = fits.Header({"TARGPROP": HOSTILE})
     evil = replace(whole.sequence.science[0], header=header, name=HOSTILE, filter=HOSTILE)
@@ -544,6 +544,10 @@ def shown():
 
 def test_a_notebook_shows_a_small_escaped_summary():
     for name, value in shown().items():
+        assert len(repr(value)) < 400
+        assert "array(" not in repr(value)
+        if name not in ("Refinement", "Detection", "Reduction"):
+            continue
         text = value._repr_html_()
         assert len(text) < 4000
         page = Tags(text)
@@ -551,9 +555,7 @@ def test_a_notebook_shows_a_small_escaped_summary():
         assert all(set(attributes) <= {"style"} for _, attributes in page.tags)
         said = " ".join(page.words)
         assert name in said
-        assert (HOSTILE in said) == (name != "OpticalSystem"), name
-        assert len(repr(value)) < 400
-        assert "array(" not in repr(value)
+        assert HOSTILE in said
 
 
 BROWSER = next(

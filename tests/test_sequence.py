@@ -219,7 +219,7 @@ def test_a_refinement_survives_the_file(tmp_path):
         assert ours.observation.position_angle == theirs.observation.position_angle
         assert ours.observation.target == "TARGET"
     places = [[0.4, 0.5], [0.5, -0.3]]
-    again, first = dr.measure(back, places), dr.measure(fit, places)
+    again, first = (dr.detect(each).measure(places) for each in (back, fit))
     np.testing.assert_array_equal(again["contrast"], first["contrast"])
     np.testing.assert_array_equal(again["contrast_error"], first["contrast_error"])
 

@@ -1,9 +1,8 @@
-"""Rows on what the images are for: Jacobian, refinement, S/N map, contrast curve."""
+"""Rows on what the images are for: Jacobian, refinement, S/N map."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -14,31 +13,29 @@ from torch import Tensor
 from benchmarks.speed.case import Accuracy, Case
 from benchmarks.speed.rivals import paper_recipe
 from benchmarks.speed.setting import Setting, coarse_steps
-from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
+from pyklip_diffrender.detection import Detection, detect
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.measurement import contrasts_at
+from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.linear.response import NANOMETRE, WavefrontResponse, downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
-from pyklip_diffrender.scene.objects import Planet, Scene
-from pyklip_diffrender.scene.simulation import planet_photons
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
 
 __all__ = [
-    "CONTRAST",
     "JACOBIAN",
     "MAP",
     "REFINEMENT",
-    "contrast",
     "jacobian",
     "refinement",
     "snr_map",
 ]
 
 JACOBIAN, REFINEMENT = "Jacobian", "refinement"
-MAP, CONTRAST = "S/N map", "contrast curve"
+MAP = "S/N map"
 
 _ADAM_STEPS, _LEARNING_RATE = 1000, 1e-11
-_SEPARATIONS, _ANGLES = 20, 6
 
 
 def basis_of(setting: Setting) -> Basis:
@@ -254,10 +251,11 @@ def snr_map(setting: Setting) -> list[Case]:
         """S/N on the map against single sources through the fine model, at pixel centres."""
         grid = detection.grid.reshape(-1, 2)
         nearest = [int(np.hypot(*(grid - place).T).argmin()) for place in _ring(setting)]
-        exact = measure(detection.fits, grid[nearest], scatter=detection.scatter)["snr"]
-        return Accuracy(float(np.abs(detection.snr.reshape(-1)[nearest] - exact).max()))
+        single = detection.measure(grid[nearest])["snr"]
+        return Accuracy(float(np.abs(detection.snr.reshape(-1)[nearest] - single).max()))
 
-    pixels = setting.fov**2
+    pixels, places = setting.fov**2, _ring(setting)[:2]
+    unscaled = ErrorFactor.constant(1.0)
     return [
         Case(
             MAP,
@@ -269,59 +267,10 @@ def snr_map(setting: Setting) -> list[Case]:
         Case(
             MAP,
             "one call of the fine model a position",
-            lambda: (fit(), lambda: measure(fit(), _ring(setting)[:2], relinearise=np.inf))[1],
+            lambda: (fit(), lambda: contrasts_at(groups_of([fit()]), places, unscaled))[1],
             lambda _: Accuracy(0.0),
             reference=True,
             times=pixels / 2,
             note="two positions timed",
-        ),
-    ]
-
-
-def contrast(setting: Setting) -> list[Case]:
-    """5 sigma contrast at 20 separations and 6 angles."""
-    fit = partial(_fitted, setting)
-    farthest = 0.65 if setting.quick else 2.2
-    separations = np.linspace(0.3, farthest, _SEPARATIONS)
-    radius = 0.5 * (0.3 + farthest)
-
-    def injected() -> tuple[float, float]:
-        """Inject at the limit, refine, measure: the measured limit over the closed form's."""
-        offset = np.array([[0.0, radius]])
-        limit = 5 * float(measure(fit(), offset)["contrast_error"][0])
-        planet = Planet(limit, radius, 0.0)
-        light = planet_photons(setting.model, Scene(), planet, setting.opd)
-        observation = setting.observation
-        data = observation.data + light
-        refitted = _fit(setting, replace(observation, data=data))
-        row = measure(refitted, offset)[0]
-        before = measure(fit(), offset)[0]
-        throughput = (float(row["contrast"]) - float(before["contrast"])) / limit
-        return 5 * float(row["contrast_error"]) / limit, throughput
-
-    def judge(_: Any) -> Accuracy:
-        ratio, throughput = _once()
-        return Accuracy(max(abs(ratio - 1), abs(throughput - 1)))
-
-    @lru_cache(maxsize=1)
-    def _once() -> tuple[float, float]:
-        return injected()
-
-    return [
-        Case(
-            CONTRAST,
-            f"this package, {_SEPARATIONS} x {_ANGLES} positions",
-            lambda: (fit(), lambda: contrast_curve(fit(), separations, angles=_ANGLES))[1],
-            judge,
-            note="error: the limit and the light kept of an injected planet, against 1",
-        ),
-        Case(
-            CONTRAST,
-            f"{_SEPARATIONS * _ANGLES} injections, each refined again",
-            lambda: (fit(), injected)[1],
-            lambda _: Accuracy(0.0),
-            reference=True,
-            times=_SEPARATIONS * _ANGLES,
-            note="one injection timed",
         ),
     ]

@@ -35,8 +35,6 @@ _TARGETS: tuple[tuple[str, str, str, str, float, float, str], ...] = (
      "error"),
     ("Jacobian", "this package, 10 wavelengths on 128", "float32",
      "this package, 1846 modes on 128", 0.1, math.nan, "error"),
-    ("contrast curve", "this package, 20 x 6 positions", "float64",
-     "120 injections, each refined again", 50, 0.05, "error"),
 )  # fmt: skip
 """Goals of speed at a given error. An error of NaN: at most that of the other."""
 

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from benchmarks.speed.case import Case
 from benchmarks.speed.images import FORWARD, STEP, forward, step
 from benchmarks.speed.inference import (
-    CONTRAST,
     JACOBIAN,
     MAP,
     REFINEMENT,
-    contrast,
     jacobian,
     refinement,
     snr_map,
@@ -47,7 +45,6 @@ ROWS = (
     Row(JACOBIAN, jacobian, "of the derivatives of some modes, relative L2"),
     Row(REFINEMENT, refinement, "of the star model, rms in units of the noise"),
     Row(MAP, snr_map, "of S/N at some positions, largest difference"),
-    Row(CONTRAST, contrast, "limit and light kept of an injected planet, relative"),
     Row(SCALING, scaling, "none"),
 )
 """In the order of the table."""

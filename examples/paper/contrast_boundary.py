@@ -28,9 +28,9 @@ import numpy as np
 import torch
 from astropy.table import Table
 from matplotlib.figure import Figure
+from photutils.aperture import CircularAperture
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection.metrics import aperture_sum
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.instrument.masks import MASKS
 from pyklip_diffrender.refinement import Refinement
@@ -92,7 +92,7 @@ def one_seed(setup: Setting, places: tuple[float, ...], steps: int, seed: int) -
     shot = frame(setup, HOURS, seed)
     frames = references(setup, HOURS, seed)
     empty = all_of(setup, shot, frames, steps)
-    curve = dr.contrast_curve(empty["Gauss-Newton"].fit, places, angles=60)
+    curve = dr.detect(empty["Gauss-Newton"].fit, separations=places).contrast_curve
     closed = {round(float(row["separation"].value), 3): row for row in curve}
     rows = []
     # Neighbours in separation are in different frames, and on other sides of the star.
@@ -132,10 +132,10 @@ def one_place(
     planet = with_sources.planets[which][0]
     position = pixel(setup, planet.offset)
     ring = Ring(setup, with_sources, which)
-    count = aperture_sum(np.ones_like(with_sources.star), position, APERTURE)
-    unit = (
-        aperture_sum(with_sources.planets[which][1], position, APERTURE) / count / planet.contrast
-    )
+    aperture = CircularAperture(position, APERTURE)
+    (count,), _ = aperture.do_photometry(np.ones_like(with_sources.star), method="center")
+    (light,), _ = aperture.do_photometry(with_sources.planets[which][1], method="center")
+    unit = light / count / planet.contrast
     # With the true star: 1, but for the planet's own noise and the wings of the other planets.
     difference = full["optimal"].image - empty["optimal"].image
     total = throughput_of(setup, with_sources, difference, np.zeros_like(difference), which)

@@ -36,11 +36,11 @@ def one_frame(setup: Setting, contrast: float, separation: float, seed: int) -> 
         # The limit at that very place, from a frame without a planet.
         empty = dr.refine(setup.model, frame(setup, HOURS, 5000 + seed).observation, setup.measured)
         place = Planet(0.0, separation, angle).offset
-        contrast = 5 * float(dr.measure(empty, [place])["contrast_error"][0])
+        contrast = 5 * float(dr.detect(empty).measure([place])["contrast_error"][0])
     planet = Planet(contrast, separation, angle)
     shot = frame(setup, HOURS, seed, [planet])
     fit = dr.refine(setup.model, shot.observation, setup.measured)
-    row = dr.measure(fit, [planet.offset])[0]
+    row = dr.detect(fit).measure([planet.offset])[0]
     # What the fit's own residual kept of it, by a matched filter on the true noise.
     weight = shot.planets[0][1] / shot.noise**2
     light = float((weight * shot.planets[0][1]).sum())

@@ -242,3 +242,13 @@ def methods_in(table: Table) -> Sequence[str]:
     """Methods of a table, in the usual order."""
     names = set(table["method"])
     return [name for name in ORDER if name in names]
+
+
+def psnr(image: Image, reference: Image, position: tuple[float, float], size: int = 11) -> float:
+    """Peak signal-to-noise ratio in dB over `size` x `size` pixels about `position` (x, y)."""
+    x, y = (round(c - (size - 1) / 2) for c in position)
+    window = (slice(max(y, 0), y + size), slice(max(x, 0), x + size))
+    error = float(np.mean((image[window] - reference[window]) ** 2))
+    if error == 0:
+        return math.inf
+    return 10 * math.log10(float(reference[window].max()) ** 2 / error)

@@ -23,10 +23,9 @@ from astropy.table import Table
 from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).parent))
-from judging import COLOURS, pixel, select, spread, star_error
+from judging import COLOURS, pixel, psnr, select, spread, star_error
 from methods import (
     QUICK,
     STEPS,
@@ -116,7 +115,7 @@ def one_frame(
     if steps:
         subtracted["Adam, held"] = adam(setup, shot, steps)
     assert fitted.fit is not None
-    planet = dr.measure(fitted.fit, [PLANET.offset])[0]
+    planet = dr.detect(fitted.fit).measure([PLANET.offset])[0]
     rows = []
     for name, result in subtracted.items():
         rows.append(

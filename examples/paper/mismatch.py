@@ -58,7 +58,7 @@ def one_seed(setup: Setting, seed: int) -> Table:
     truth = {"star_offset": OFFSET, "lyot_shift": LYOT, "lyot_rotation": ROTATION}
     held = GaussNewton(free=("flux", "background"))
     aligned = dr.refine(setup.model, shot, setup.measured, settings=held, start=truth)
-    matched = dr.measure(aligned, [PLANET.offset])
+    matched = dr.detect(aligned).measure([PLANET.offset])
     fit = dr.refine(setup.model, shot, setup.measured)
     detection = dr.detect(fit)
     planet = detection.measure([PLANET.offset])

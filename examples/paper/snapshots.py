@@ -39,7 +39,7 @@ def one_seed(setup: Setting, counts: tuple[int, ...], linked: int, seed: int) ->
     fits = [dr.refine(setup.model, shot, setup.measured) for shot in shots]
     rows = []
     for count in counts:
-        separate = dr.measure(fits[:count], [PLANET.offset])
+        separate = dr.detect(fits[:count]).measure([PLANET.offset])
         row = {
             "snapshots": count,
             "seed": seed,
@@ -51,7 +51,7 @@ def one_seed(setup: Setting, counts: tuple[int, ...], linked: int, seed: int) ->
         if 1 < count <= linked:
             settings = GaussNewton(drift=DRIFT)
             joint = dr.refine(setup.model, shots[:count], setup.measured, settings=settings)
-            together = dr.measure(joint, [PLANET.offset])
+            together = dr.detect(joint).measure([PLANET.offset])
             row["linked"] = float(together["contrast"][0])
             row["linked_error"] = float(together["contrast_error"][0])
         rows.append(row)

@@ -1,4 +1,4 @@
-"""Seconds for refinement, contrast curve and S/N map, beside the paper's recipe in the same run.
+"""Seconds for refinement and search, beside the paper's recipe in the same run.
 
     python examples/paper/speed.py --opd BEFORE AFTER
 
@@ -38,13 +38,10 @@ def measured(
         times = [time.perf_counter()]
         fit = dr.refine(setup.model, shot.observation, setup.measured)
         times.append(time.perf_counter())
-        dr.contrast_curve(fit)
-        times.append(time.perf_counter())
-        detection = None
         if star_known:
-            detection = dr.detect(fit)
+            dr.detect(fit)
         times.append(time.perf_counter())
-        refine, curve, detect = np.diff(times)
+        refine, detect = np.diff(times)
         (fitted,) = fit.frames
         star = fitted.star - float(fitted.values["background"][0])
         rows.append(
@@ -52,10 +49,8 @@ def measured(
                 "model": name,
                 "run": run,
                 "refine": refine,
-                "contrast_curve": curve,
-                "refine_and_curve": refine + curve,
-                "detect": detect if detection is not None else np.nan,
-                "all": refine + curve + detect if detection is not None else np.nan,
+                "detect": detect if star_known else np.nan,
+                "all": refine + detect if star_known else np.nan,
                 "star_error": float(np.sqrt(np.mean(((star - shot.star) / shot.noise) ** 2))),
             }
         )
@@ -75,8 +70,6 @@ def recipe(setup: Setting) -> dict[str, Any]:
         "model": "monochromatic, Adam recipe, 1000 steps",
         "run": f"{STEPS} steps",
         "refine": milliseconds,
-        "contrast_curve": np.nan,
-        "refine_and_curve": np.nan,
         "detect": np.nan,
         "all": np.nan,
         "star_error": np.nan,

@@ -319,18 +319,14 @@ def about_speed() -> list[str]:
         (
             str(row["model"]),
             str(row["run"]),
-            *(
-                "" if math.isnan(row[name]) else f"{row[name]:.1f}"
-                for name in ("refine", "refine_and_curve", "all")
-            ),
+            *("" if math.isnan(row[name]) else f"{row[name]:.1f}" for name in ("refine", "all")),
             "" if math.isnan(row["star_error"]) else f"{row['star_error']:.2f}",
         )
         for table in by_kind.values()
         for row in table
     ]
     header = (
-        "80 x 80 pixels", "run", "refinement, s", "and contrast curve, s", "and S/N map, s",
-        "star error, sigma",
+        "80 x 80 pixels", "run", "refinement, s", "and search, s", "star error, sigma",
     )  # fmt: skip
     return [
         "## How long it takes",

@@ -26,7 +26,7 @@ from pyklip_diffrender.detection.recovery import (
     recover_planets,
     with_planets,
 )
-from pyklip_diffrender.detection.search import contrast_curve, detect, measure
+from pyklip_diffrender.detection.search import detect
 from pyklip_diffrender.detection.search_result import Detection, draw_curve
 from pyklip_diffrender.detection.sky_map import SkyMap
 from pyklip_diffrender.detection.templates import combine_frames
@@ -53,14 +53,12 @@ __all__ = [
     "combine",
     "combine_frames",
     "completeness",
-    "contrast_curve",
     "contrast_of_completeness",
     "detect",
     "draw_curve",
     "fit_disk",
     "has_bright_pixels_beyond",
     "image_hdu",
-    "measure",
     "measured_planet",
     "metrics",
     "recover_planets",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from pyklip_diffrender.detection.sky_map import SkyMap, SkyStack, date_of, epoch
 from pyklip_diffrender.instrument.spectrum import PlanetSpectra
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
 from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.io.tables import Column, add_columns, plain_rows
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement.fit_file import text_hdu
 
@@ -204,9 +204,9 @@ class Combination:
                 None if self.motion is None else list(self.motion.proper)
             ),
             "parallax_arcsec": None if self.motion is None else self.motion.parallax or None,
-            "candidates": _plain_rows(self.candidates),
-            "sightings": _plain_rows(self.sightings),
-            "limits": _plain_rows(self.limits),
+            "candidates": plain_rows(self.candidates),
+            "sightings": plain_rows(self.sightings),
+            "limits": plain_rows(self.limits),
             "remarks": list(self.remarks),
         }  # fmt: skip
 
@@ -273,7 +273,7 @@ def candidates_table(
     def numbers(name: str) -> Image:
         return np.array([getattr(each, name) for each in sources], dtype=float)
 
-    columns: list[tuple[str, Any, Any, str, str]] = [
+    columns: list[Column] = [
         ("separation", positions.separation, u.arcsec, ".4f", "from the star"),
         ("position_angle", positions.position_angle, u.deg, ".2f", "east of north"),
         ("snr", numbers("snr"), None, ".1f", "flux over its error, with the spectrum"),
@@ -329,7 +329,7 @@ def candidates_table(
             ("verdict", texts(each.verdict for each in known), None, "",
              "hypothesis of at least 99 %"),
         ]  # fmt: skip
-    return _described(columns)
+    return add_columns(QTable(), columns)
 
 
 def sightings_table(sources: Sequence[CombinedSource]) -> QTable:
@@ -339,16 +339,17 @@ def sightings_table(sources: Sequence[CombinedSource]) -> QTable:
     covariance = np.array([each for *_, each in rows]).reshape(-1, 2, 2)
     numbers = np.array([each[0] for each in rows], dtype=int)
     dates = np.array([each[1] for each in rows], dtype=float)
-    return _described(
+    return add_columns(
+        QTable(),
         [
             ("candidate", numbers, None, "", "row in the table of candidates, from 1"),
             ("epoch_mjd", dates, None, ".5f", "of the position, UTC"),
             *_offsets(places, covariance),
-        ]
+        ],
     )
 
 
-def _offsets(places: Image, covariance: Image) -> list[tuple[str, Any, Any, str, str]]:
+def _offsets(places: Image, covariance: Image) -> list[Column]:
     """Columns of offsets (k, 2) to the east and north, arcsec, with covariances (k, 2, 2)."""
     east_error, north_error, correlation = deviations_and_correlation(covariance)
     return [
@@ -393,7 +394,8 @@ def limits_table(
                 contrast = flux / stars[spectra.filters[f]]
                 rows.append((name, separation, spectra.filters[f], contrast))
     names, places, best, contrasts = zip(*rows, strict=True) if rows else ((),) * 4
-    table = _described(
+    table = add_columns(
+        QTable(),
         [
             ("spectrum", np.array(names, dtype="U60"), None, "", "of the planet"),
             ("separation", np.array(places, dtype=float), u.arcsec, ".2f", "from the star"),
@@ -406,16 +408,6 @@ def limits_table(
         ]
     )  # fmt: skip
     table.meta["sigmas"] = level
-    return table
-
-
-def _described(columns: Sequence[tuple[str, Any, Any, str, str]]) -> QTable:
-    """Make a table of columns: name, values, unit, format and description."""
-    table = QTable()
-    for name, values, unit, form, about in columns:
-        table[name] = values if unit is None else values * unit
-        table[name].info.format = form or None
-        table[name].info.description = about
     return table
 
 
@@ -432,19 +424,3 @@ def scales_of(maps: Sequence[SkyMap], unit: str) -> dict[str, float]:
 def star_of_filter(maps: Sequence[SkyMap], name: str, scales: Mapping[str, float]) -> float:
     """Flux of the star in a filter, mean over its maps."""
     return float(np.mean([scales[each.name] for each in maps if each.filter == name]))
-
-
-def _plain_rows(table: QTable) -> list[dict[str, Any]]:
-    """Rows of a table as plain values, with the unit in the names; None for what is not known."""
-    rows = []
-    for row in table:
-        values = {}
-        for name in table.colnames:
-            unit = table[name].unit
-            label = name if unit in (None, u.mag) else f"{name}_{unit}"
-            value = getattr(row[name], "value", row[name])
-            value = value.item() if isinstance(value, np.generic | np.ndarray) else value
-            is_known = not isinstance(value, float) or math.isfinite(value)
-            values[label] = value if is_known else None
-        rows.append(values)
-    return rows

@@ -16,7 +16,7 @@ from astropy.table import QTable, Table
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.error_factor import ErrorFactor, described
+from pyklip_diffrender.detection.error_factor import ErrorFactor, curve_table
 from pyklip_diffrender.detection.field import Image, Sky
 from pyklip_diffrender.detection.templates import Group, groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -248,12 +248,13 @@ def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
 
 def _searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a detection that do not need its fits; raises as `_maps_of`."""
+    curve = facts["contrast_curve"]
     return {
         "threshold": facts["threshold"],
         "sources": _candidates_of(facts["candidates"]),
         "false_alarm": np.array(facts["false_alarm"], dtype=float),
-        "rings": _table_of(facts["rings"]),
-        "contrast_curve": described(_table_of(facts["contrast_curve"])),
+        "rings": QTable(_columns_of(facts["rings"]), meta=facts["rings"]["meta"]),
+        "contrast_curve": curve_table(_columns_of(curve), curve["meta"]),
         **_maps_of(hdus),
     }
 
@@ -297,13 +298,12 @@ def _table_facts(table: QTable) -> dict[str, Any]:
     return {"columns": {name: table[name] for name in table.colnames}, "meta": table.meta}
 
 
-def _table_of(facts: dict[str, Any]) -> QTable:
-    """Make a table of numbers from what `_table_facts` returned."""
-    columns = {
+def _columns_of(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns of numbers of what `_table_facts` returned."""
+    return {
         name: column if hasattr(column, "unit") else np.array(column, dtype=np.float64)
         for name, column in facts["columns"].items()
     }
-    return QTable(columns, meta=facts["meta"])
 
 
 def digest(fit: Refinement) -> str:

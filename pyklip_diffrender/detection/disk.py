@@ -48,7 +48,6 @@ from pyklip_diffrender.detection.templates import (
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.headers import fits_unit, set_keyword
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import require_positive, to_arcsec
 from pyklip_diffrender.refinement import Refinement
@@ -218,18 +217,6 @@ class Disk:
         return (
             f"<Disk: {len(self.contrasts)} sources, {self.contrast:.3g} of the star's light, "
             f"chi-squared lower by {self.gain:.4g}>"
-        )
-
-    def _repr_html_(self) -> str:
-        angle = self.orientation
-        return html_summary(
-            f"Disk about {self.fit.frames[0].observation.target}",
-            {
-                "Light": f"{self.contrast:.3g} of the star's",
-                "Sources": len(self.contrasts),
-                "Decrease of chi-squared": f"{self.gain:.4g}",
-                "Position angle of the long axis": None if angle is None else f"{angle:.1f} deg",
-            },
         )
 
     @property

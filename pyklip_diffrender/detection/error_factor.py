@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from astropy import units as u
@@ -38,6 +39,7 @@ from pyklip_diffrender.detection.field import (
     reaching,
     separation_of,
 )
+from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.refinement.residual import local_maxima
 
 __all__ = [
@@ -47,7 +49,7 @@ __all__ = [
     "Significance",
     "compact_structures",
     "contrast_table",
-    "described",
+    "curve_table",
     "structures_in_single_roll",
 ]
 
@@ -550,19 +552,16 @@ def contrast_table(
         rows.append(
             (separation, middle, magnitude, limit.min(), limit.max(), bound, middle * correction)
         )
-    names = [name for name in _COLUMNS if name not in ("error_factor", "flux_density")]
-    table = QTable(rows=rows, names=names, dtype=(float,) * len(names))
-    for name, unit in (("separation", u.arcsec), ("delta_mag", u.mag)):
-        table[name] = np.asarray(table[name]) * unit
-    table["error_factor"] = factor.at(table["separation"].value)
+    values = dict(zip(_COLUMNS, np.array(rows, dtype=float).reshape(-1, 7).T, strict=False))
+    values["error_factor"] = factor.at(values["separation"])
     if star is not None:
-        table["flux_density"] = star * np.asarray(table["contrast"]) * u.Jy
-    table.meta = {"sigmas": _SIGMAS, "resolution_arcsec": resolution}
-    return described(table)
+        values["flux_density"] = star * values["contrast"]
+    units = {"separation": u.arcsec, "delta_mag": u.mag, "flux_density": u.Jy}
+    curve = {name: each * units.get(name, 1) for name, each in values.items()}
+    return curve_table(curve, {"sigmas": _SIGMAS, "resolution_arcsec": resolution})
 
 
-def described(table: QTable) -> QTable:
-    """Give the columns of a contrast curve their formats and descriptions."""
-    for name in table.colnames:
-        table[name].info.format, table[name].info.description = _COLUMNS[name]
-    return table
+def curve_table(values: Mapping[str, Any], meta: Mapping[str, Any]) -> QTable:
+    """Make the table of a contrast curve of its columns, whose units are their own."""
+    columns = ((name, each, None, *_COLUMNS[name]) for name, each in values.items())
+    return add_columns(QTable(meta=meta), columns)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +30,7 @@ from pyklip_diffrender.detection.field import (
 )
 from pyklip_diffrender.detection.templates import Group, has_only_reference_stars, weigh
 from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.io.tables import Column, add_columns
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import FrameFit, Refinement
@@ -156,9 +156,6 @@ def _residual(frame: FrameFit) -> Image:
 
 
 # Tables of candidates and of measurements, with what they mean on the sky.
-
-Column = tuple[str, Any, Any, str, str]
-"""Name, values, unit, format and description."""
 
 _SNR = "contrast over its error for a known position, without calibration errors"
 
@@ -310,12 +307,7 @@ def _epoch(count: int, sky: Sky) -> Iterator[Column]:
 def _table(columns: list[Column], first: tuple[str, ...]) -> QTable:
     """Table of columns, some of them first: a table too wide to print loses its middle."""
     ordered = sorted(columns, key=lambda each: first.index(each[0]) if each[0] in first else 99)
-    table = QTable()
-    for name, values, unit, form, description in ordered:
-        table[name] = values if unit is None else values * unit
-        table[name].info.format = form or None
-        table[name].info.description = description
-    return table
+    return add_columns(QTable(), ordered)
 
 
 # Errors and thresholds of a search, from the residuals of its fits.
@@ -407,12 +399,16 @@ def chi2_by_ring(groups: Sequence[Group], sources: Tensor, factor: ErrorFactor) 
         ring = (distance >= low) & (distance <= high)
         if ring.any():
             rows.append((low, high, square[ring].mean(), float(factor.at((low + high) / 2))))
-    table = QTable(rows=rows, names=("inner", "outer", "chi2", "error_factor"), dtype=[float] * 4)
-    for name in ("inner", "outer"):
-        table[name] = np.asarray(table[name]) * u.arcsec
-    for name in table.colnames:
-        table[name].info.format = ".2f"
-    return table
+    inner, outer, chi2, factors = np.array(rows, dtype=float).reshape(-1, 4).T
+    return add_columns(
+        QTable(),
+        [
+            ("inner", inner, u.arcsec, ".2f", "smallest separation from the star"),
+            ("outer", outer, u.arcsec, ".2f", "largest separation from the star"),
+            ("chi2", chi2, None, ".2f", "per pixel, without the candidates"),
+            ("error_factor", factors, None, ".2f", "by which errors were multiplied"),
+        ],
+    )
 
 
 def _reduced_chi2(groups: Sequence[Group], offsets: Tensor) -> float:

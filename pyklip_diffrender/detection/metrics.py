@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 
-__all__ = ["annulus_snr", "aperture_sum", "psnr", "star_model_error", "throughput"]
+__all__ = ["annulus_snr", "star_model_error", "throughput"]
 
 Image = NDArray[np.float64]
 Position = tuple[float, float]
@@ -34,11 +34,6 @@ def _inside(aperture: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Mask of the pixels of an image that are in an aperture."""
     inside = aperture.to_mask(method="center").to_image(shape)
     return np.zeros(shape, dtype=bool) if inside is None else inside > 0
-
-
-def aperture_sum(image: Image, position: Position, radius: float) -> float:
-    """Sum over the pixels whose centres lie within `radius` pixels of `position` (x, y)."""
-    return float(image[_inside(_circle(position, radius), image.shape)].sum())
 
 
 def annulus_snr(
@@ -119,13 +114,3 @@ def star_model_error(
     """Rms of (model - true star) / noise over an annulus between two radii in pixels."""
     ring = _inside(_ring(center, inner, outer), truth.shape)
     return float(np.sqrt(np.mean(((model - truth) / noise)[ring] ** 2)))
-
-
-def psnr(image: Image, reference: Image, position: Position, size: int = 11) -> float:
-    """Peak signal-to-noise ratio in dB over `size` x `size` pixels about `position` (x, y)."""
-    x, y = (round(c - (size - 1) / 2) for c in position)
-    window = (slice(max(y, 0), y + size), slice(max(x, 0), x + size))
-    error = float(np.mean((image[window] - reference[window]) ** 2))
-    if error == 0:
-        return math.inf
-    return 10 * math.log10(float(reference[window].max()) ** 2 / error)

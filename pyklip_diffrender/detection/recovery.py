@@ -20,6 +20,7 @@ from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import ProgressBar
+from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.io.units import full_circle
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
@@ -64,17 +65,6 @@ _NEXT = 47.0
 _STEP = 10.0
 """Degrees by which a planet is moved on until its place is free."""
 
-_COLUMNS = {
-    "separation": ".3f",
-    "position_angle": ".1f",
-    "injected": ".2e",
-    "contrast": ".2e",
-    "contrast_error": ".1e",
-    "snr": ".1f",
-    "detected": None,
-}
-_UNITS = {"separation": u.arcsec, "position_angle": u.deg}
-
 
 class MeasuredPlanet(NamedTuple):
     """Measurement of a planet."""
@@ -113,7 +103,7 @@ def recover_planets(
     """
     frames = [each for each in detection.fits[0].frames if not each.observation.reference]
     curve = detection.contrast_curve
-    planets = QTable(names=list(_COLUMNS), dtype=[float] * (len(_COLUMNS) - 1) + [bool])
+    rows: list[tuple[float, ...]] = []
     inner, outer = (float(end) for end in curve["separation"].value[[0, -1]])
     together = int(np.clip((outer - inner) / _APART, 1, _TOGETHER))
     for trial, start in enumerate(range(0, count, together)):
@@ -138,13 +128,20 @@ def recover_planets(
         for planet in injected:
             angle = full_circle(planet.position_angle + detection.north)
             measured = measured_planet(again, planet.offset, frames[0].flux)
-            planets.add_row((planet.separation, angle, planet.contrast, *measured))
-    for name, unit in _UNITS.items():
-        planets[name] = planets[name] * unit
-    for name, form in _COLUMNS.items():
-        planets[name].info.format = form
-    planets.meta["strength"] = _STRENGTH
-    return planets
+            rows.append((planet.separation, angle, planet.contrast, *measured))
+    separation, angles, true, *found, detected = np.array(rows, dtype=float).reshape(-1, 7).T
+    return add_columns(
+        QTable(meta={"strength": _STRENGTH}),
+        [
+            ("separation", separation, u.arcsec, ".3f", "from the star"),
+            ("position_angle", angles, u.deg, ".1f", "as in the table of candidates"),
+            ("injected", true, None, ".2e", "contrast"),
+            ("contrast", found[0], None, ".2e", "of the candidate, or else measured at the place"),
+            ("contrast_error", found[1], None, ".1e", "without the error of the star's flux"),
+            ("snr", found[2], None, ".1f", "contrast over its error for a known position"),
+            ("detected", detected.astype(bool), None, "", "whether there is such a candidate"),
+        ],
+    )
 
 
 def with_planets(frames: Sequence[FrameFit], planets: Sequence[Planet]) -> tuple[Observation, ...]:
@@ -326,14 +323,16 @@ def completeness(
                 (separation, strength * limit, fraction, len(offsets))
                 for strength, fraction in zip(strengths, detected.mean(axis=1), strict=True)
             ]
-    table = QTable(
-        rows=rows,
-        names=("separation", "contrast", "completeness", "planets"),
-        dtype=[float, float, float, int],
+    at, contrasts, found, planets = np.array(rows, dtype=float).reshape(-1, 4).T
+    table = add_columns(
+        QTable(),
+        [
+            ("separation", at, u.arcsec, ".3f", "from the star"),
+            ("contrast", contrasts, None, ".2e", "of the planets"),
+            ("completeness", found, None, ".2f", "fraction of the planets that is found"),
+            ("planets", planets.astype(int), None, "", "number of planets"),
+        ],
     )
-    table["separation"] = np.asarray(table["separation"]) * u.arcsec
-    for name, form in {"separation": ".3f", "contrast": ".2e", "completeness": ".2f"}.items():
-        table[name].info.format = form
     table.meta = {
         "threshold": detection.threshold,
         "false_alarm": significance.false_alarm(detection.threshold),

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
@@ -37,25 +36,16 @@ from pyklip_diffrender.detection.field import (
     ring_pixels,
     separation_of,
 )
-from pyklip_diffrender.detection.measurement import (
-    chi2_by_ring,
-    contrasts_at,
-    error_inflation,
-    follows_scatter,
-    measured_table,
-    significance_of,
-)
+from pyklip_diffrender.detection.measurement import chi2_by_ring, significance_of
 from pyklip_diffrender.detection.search_result import Detection
-from pyklip_diffrender.detection.templates import groups_of, has_only_reference_stars, weigh
+from pyklip_diffrender.detection.templates import groups_of, has_only_reference_stars
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import require_positive, to_arcsec
 from pyklip_diffrender.refinement import Refinement, Status
 from pyklip_diffrender.refinement.residual import local_maxima
 
 __all__ = [
-    "contrast_curve",
     "detect",
-    "measure",
     "side_lobes",
     "with_raised_peaks",
 ]
@@ -179,9 +169,6 @@ _HIDDEN = 0.8
 """Part of the threshold above which a peak in several rolls is tried as a candidate though its S/N
 is below: the side lobes of a source raise the scatter by which it is judged. In a single roll, the
 light of structures of the detector would pass."""
-
-_SOURCE = 5.0
-"""S/N above which `measure` removes a source before it computes the default `scatter`."""
 
 
 @dataclass(frozen=True)
@@ -351,160 +338,6 @@ def _require_shape(actual: tuple[int, ...], expected: tuple[int, ...]) -> None:
         raise IncompatibleSetupError(
             f"without_limits: got the shape {actual}; expected that of the first frame, {expected}"
         )
-
-
-def measure(
-    fits: Fits,
-    offsets: ArrayLike,
-    *,
-    scatter: float | None = None,
-    relinearise: float = 25.0,
-    sigmas: float = 5.0,
-) -> QTable:
-    """Measure the contrasts of point sources at given positions, one at a time.
-
-    Parameters
-    ----------
-    fits : Refinement or sequence of Refinement
-    offsets : array or Quantity, (k, 2)
-        x, y from the star, arcsec, image orientation of the first frame.
-    scatter : float, optional
-        Factor by which the errors are multiplied. Default as for `detect`.
-    relinearise : float
-        See `detect`.
-    sigmas : float
-        S/N of a detection, below which an upper limit is stated; 3 and 5 are usual.
-
-    Returns
-    -------
-    QTable
-        See `Detection.measure`.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        See `detect`; also for a position outside the field.
-    NonFiniteError, ShapeError, UnitError
-
-    Examples
-    --------
-    >>> import pyklip_diffrender as dr
-    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
-    >>> scene = dr.Scene(planets=(dr.Planet.from_offset(1e-4, 0.3, -0.5),))
-    >>> frame = dr.simulate(model, scene, opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
-    >>> table = dr.measure(fit, [[0.3, -0.5]])
-    >>> print(f"{table['contrast'][0]:.1e}")
-    1.0e-04
-    """
-    fits = _checked(fits)
-    require_positive(scatter=scatter, sigmas=sigmas)
-    if scatter is None and follows_scatter(fits):
-        return detect(fits, relinearise=relinearise).measure(offsets, sigmas=sigmas)
-    table, calibration, factor = _measured(fits, offsets, scatter)
-    bright = table[table["snr"] > relinearise]
-    if len(bright):
-        fits = with_companions(fits, _as_candidates(bright))
-        table, calibration, factor = _measured(fits, offsets, scatter)
-    return measured_table(table, calibration, Sky.of(fits, factor), sigmas)
-
-
-def _measured(
-    fits: Sequence[Refinement], offsets: ArrayLike, scatter: float | None
-) -> tuple[QTable, Image, float]:
-    """Contrasts, their calibration errors, and the factor by which all errors are multiplied."""
-    groups = groups_of(fits)
-    factor = 1.0 if scatter is None else scatter
-    table, calibration = contrasts_at(groups, offsets, ErrorFactor.constant(factor))
-    if scatter is None:
-        sources = _as_candidates(table[table["snr"] > _SOURCE])
-        companions = Candidates.of_fit(fits[0])
-        factor = error_inflation(fits, groups, torch.cat([companions.offsets, sources.offsets]))
-        table, calibration = contrasts_at(groups, offsets, ErrorFactor.constant(factor))
-    return table, calibration, factor
-
-
-def _as_candidates(table: QTable) -> Candidates:
-    return Candidates.at(
-        np.stack([table["x"].value, table["y"].value], axis=1), np.asarray(table["contrast"])
-    )
-
-
-def contrast_curve(
-    fits: Fits,
-    separations: ArrayLike | None = None,
-    *,
-    angles: int = 12,
-    scatter: float | None = None,
-) -> QTable:
-    """Compute the 5-sigma contrast curve from a few positions at each separation.
-
-    Parameters
-    ----------
-    fits : Refinement or sequence of Refinement
-    separations : array or Quantity, optional
-        arcsec; as for `detect`.
-    angles : int
-        Largest number of positions per separation. All are used where errors are scaled to the
-        scatter of the S/N, which needs the whole map.
-    scatter : float, optional
-        Factor by which the errors are multiplied. Default as for `detect`.
-
-    Returns
-    -------
-    QTable
-        One row for each separation (arcsec), with contrasts of a 5-sigma point source: the median
-        of the ring (``contrast``, also as ``delta_mag``), its ``lowest`` and ``highest`` value, the
-        median with the small-sample correction of measured errors (``small_sample``), and that of
-        a star whose image were known (``known_star``). All but the latter include
-        ``error_factor``, by which errors were multiplied; ``flux_density`` (Jy) is that of the
-        median, in the photometric calibration of the frames.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        See `detect`; also if no pixel is at any of the separations.
-
-    Examples
-    --------
-    >>> import pyklip_diffrender as dr
-    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
-    >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
-    >>> curve = dr.contrast_curve(fit, [0.4, 0.8])
-    >>> bool(curve["contrast"][0] > curve["contrast"][1])
-    True
-    """
-    fits = _checked(fits)
-    require_positive(scatter=scatter)
-    groups = groups_of(fits)
-    grid = groups[0][1].grid
-    separations = curve_separations(grid, separations)
-    rings = ring_pixels(grid, separations, angles)
-    if not any(len(ring[0]) for ring in rings):
-        raise IncompatibleSetupError(
-            f"separations: got {separations.tolist()} arcsec, where the frames have no pixel; "
-            f"the corners of the field are {separation_of(grid).max():.3g} arcsec from the star"
-        )
-    rows, columns = np.concatenate(rings, axis=1)
-    if scatter is None and follows_scatter(fits):
-        return detect(fits, separations=separations).contrast_curve
-    products = weigh(groups, lambda templates: templates.at_pixels(rows, columns))
-    if scatter is None:
-        scatter = error_inflation(fits, groups, Candidates.of_fit(fits[0]).offsets)
-    ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
-    errors = np.split(scatter * products.information.numpy() ** -0.5, ends)
-    photon = np.split(products.photon.numpy() ** -0.5, ends)
-    return contrast_table(
-        separations,
-        errors,
-        photon,
-        fits[0].model.resolution,
-        ErrorFactor.constant(scatter),
-        Sky.of(fits).star_jansky,
-    )
 
 
 def _checked(fits: Fits) -> list[Refinement]:

@@ -47,6 +47,7 @@ from pyklip_diffrender.detection.measurement import (
 from pyklip_diffrender.detection.templates import Group
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import ccd_data, world_coordinates
@@ -263,9 +264,10 @@ class Detection:
         """
         table = candidate_table(self.sources, self.error_factor, self._calibration_errors, self.sky)
         order = np.argsort(-self.sources.snr(self.error_factor))
-        table["false_alarm_probability"] = self.false_alarm[order]
-        table["false_alarm_probability"].info.format = ".1e"
-        table["false_alarm_probability"].info.description = "of a peak anywhere; NaN if not known"
+        about = "of a peak anywhere; NaN if not known"
+        add_columns(
+            table, [("false_alarm_probability", self.false_alarm[order], None, ".1e", about)]
+        )
         table.meta = dict(self.provenance)
         return table
 

@@ -6,7 +6,7 @@ import itertools
 import logging
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,7 +38,7 @@ from pyklip_diffrender.detection.search_result import Detection, draw_curve
 from pyklip_diffrender.detection.whole_frame import EDGE, REACH, WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
-from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.refinement import star_flux_error
 from pyklip_diffrender.scene.observation import Observation
@@ -111,13 +111,6 @@ class WideField:
     def __str__(self) -> str:
         """The candidates in words, at most 80 columns wide."""
         return in_words(self.candidates, self.threshold)
-
-    def _repr_html_(self) -> str:
-        ny, nx = self.snr.shape
-        facts = {"Star": self.observation.target, "Pixels": f"{nx} x {ny}"}
-        title = f"WideField: {len(self.candidates)} candidates above {self.threshold:g} sigma"
-        columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "shape")
-        return html_summary(title, facts, self.candidates, columns)
 
     @property
     def observation(self) -> Observation:
@@ -720,30 +713,33 @@ def _add_shapes(
 
     Those in the fitted pixels, None, are not judged.
     """
-    table["fit_chi2"] = chi2
-    table["fit_chi2"].info.format = ".1f"
-    table["fit_chi2"].info.description = (
-        "reduced chi-squared of the image of a point source, over the squared error factor; much "
-        "above 1 for extended and blended sources"
-    )
-    table["shape"] = np.array(
-        ["" if s is None else "extended" if s.shape else "point" for s in sources], dtype="U8"
-    )
-    table["shape"].info.description = (
-        "point, or extended for a source that is no point source, or several that are blended; "
-        "empty in the fitted pixels, where shapes are not judged"
-    )
     shapes = [None if each is None else each.shape for each in sources]
+    kinds = ["" if s is None else "extended" if s.shape else "point" for s in sources]
+
+    def numbers(values: Iterable[float]) -> Image:
+        return np.array(list(values), dtype=float)
+
+    long, short = (
+        numbers(np.nan if each is None else getattr(each, name) for each in shapes)
+        for name in ("major", "minor")
+    )
+    angles = numbers(np.nan if each is None else each.angle + detection.north for each in shapes)
     about = "full width at half maximum along the {} axis of an extended source, a Gaussian"
-    for name, axis in (("major", "long"), ("minor", "short")):
-        values = [np.nan if each is None else getattr(each, name) for each in shapes]
-        table[f"fwhm_{name}"] = np.array(values, dtype=float) * u.arcsec
-        table[f"fwhm_{name}"].info.format = ".2f"
-        table[f"fwhm_{name}"].info.description = about.format(axis)
-    angles = [np.nan if each is None else each.angle + detection.north for each in shapes]
-    table["axis_angle"] = np.array(angles, dtype=float) % 180 * u.deg
-    table["axis_angle"].info.format = ".0f"
-    table["axis_angle"].info.description = "position angle of the long axis, like position_angle"
+    add_columns(
+        table,
+        [
+            ("fit_chi2", chi2, None, ".1f",
+             "reduced chi-squared of the image of a point source, over the squared error factor; "
+             "much above 1 for extended and blended sources"),
+            ("shape", np.array(kinds, dtype="U8"), None, "",
+             "point, or extended for a source that is no point source, or several that are "
+             "blended; empty in the fitted pixels, where shapes are not judged"),
+            ("fwhm_major", long, u.arcsec, ".2f", about.format("long")),
+            ("fwhm_minor", short, u.arcsec, ".2f", about.format("short")),
+            ("axis_angle", angles % 180, u.deg, ".0f",
+             "position angle of the long axis, like position_angle"),
+        ],
+    )  # fmt: skip
 
 
 def _candidates(sources: Sequence[_Measurement]) -> Candidates:

@@ -21,7 +21,6 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.headers import set_keyword
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import ARCSEC, require_finite, to_metres, to_unit, warn_of_rms
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.fast_path import LatticeRoute, PlaneWaves
@@ -643,24 +642,6 @@ class OpticalSystem(Propagation):
             f"<OpticalSystem: {names}; {self.npix} px pupil, {waves} wavelength"
             f"{'s' if waves > 1 else ''} about {self.bandpass.mean_wavelength * 1e6:.2f} um, "
             f"{self.detector.shape[1]} x {self.detector.shape[0]} px>"
-        )
-
-    def _repr_html_(self) -> str:
-        waves, (ny, nx) = self.bandpass.wavelengths, self.detector.shape
-        scale = " x ".join(f"{each:.4f}" for each in self.detector.pixelscale)
-        return html_summary(
-            "OpticalSystem",
-            {
-                "Planes": ", ".join(
-                    [self.entrance.name, *(plane.name for plane in self.planes), self.detector.name]
-                ),
-                "Filter": self.setup.get("filter"),
-                "Wavelengths": f"{len(waves)} from {min(waves) * 1e6:.3f} to "
-                f"{max(waves) * 1e6:.3f} um",
-                "Pupil": f"{self.npix} samples across {self.diameter:.3g} m",
-                "Detector": f"{nx} x {ny} pixels of {scale} arcsec",
-                "Precision and device": f"{str(self.dtype).removeprefix('torch.')}, {self.device}",
-            },
         )
 
     @property

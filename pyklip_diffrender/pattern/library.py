@@ -27,7 +27,6 @@ from pyklip_diffrender.io.files import (
     write_fits,
 )
 from pyklip_diffrender.io.headers import fits_text
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
@@ -84,10 +83,6 @@ class PatternLibrary:
 
     def __repr__(self) -> str:
         return f"<PatternLibrary: {len(self.patterns)} frames of {', '.join(self.stars) or 'none'}>"
-
-    def _repr_html_(self) -> str:
-        facts = {"Frames": len(self.patterns), "Stars": ", ".join(self.stars) or None}
-        return html_summary("Library of flat-field patterns", facts)
 
     @property
     def stars(self) -> list[str]:

@@ -28,6 +28,7 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import pixels_of
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.scene.jwst_files import shift_frames
 from pyklip_diffrender.scene.observation import Observation
@@ -185,20 +186,17 @@ def klip_curve(
     limits = np.divide(_SIGMAS * noise, response, out=np.full_like(noise, np.inf), where=useful)
     best = limits.argmin(axis=0), np.arange(len(separations))
     limit = np.where(np.isfinite(limits[best]), limits[best], np.nan)
-    table = QTable(
-        {
-            "separation": separations * u.arcsec,
-            "contrast": limit,
-            "small_sample": limit * small_sample_factor(separations, resolution, _SIGMAS),
-            "modes": best[0] + 1,
-            "throughput": response[best] / alone,
-        },
-        meta={"sigmas": _SIGMAS, "resolution_arcsec": resolution, "label": klip.label},
+    corrected = limit * small_sample_factor(separations, resolution, _SIGMAS)
+    return add_columns(
+        QTable(meta={"sigmas": _SIGMAS, "resolution_arcsec": resolution, "label": klip.label}),
+        [
+            ("separation", separations, u.arcsec, ".3f", "from the star"),
+            ("contrast", limit, None, ".2e", "limit with the best number of modes"),
+            ("small_sample", corrected, None, ".2e", "limit with the small-sample correction"),
+            ("modes", best[0] + 1, None, "", "best number of modes"),
+            ("throughput", response[best] / alone, None, ".2f", "of injected planets"),
+        ],
     )
-    formats = {"separation": ".3f", "contrast": ".2e", "small_sample": ".2e", "throughput": ".2f"}
-    for name, form in formats.items():
-        table[name].info.format = form
-    return table
 
 
 def _has_limits(detection: Detection, grid: Image) -> NDArray[np.bool_]:

@@ -52,19 +52,20 @@ _ADVICE = {
     Status.CONVERGED: "The stated errors and limits can be used as they are.",
     Status.MODEL_MISMATCH: (
         "3 of the 7 reductions of real frames in the documentation end with this status: two of a "
-        "star with a disk, and one with a flat-field pattern that is not that of the library. The "
-        "errors have been scaled to the scatter in the S/N map. See whether a faint candidate is "
-        "in every roll and looks like a point source, and check the filter, the masks and the date "
-        "of the wavefront map."
+        "star with a disk, and one with a flat-field pattern that is not that of the library. "
+        "Errors of candidates are scaled to the scatter in the S/N map. See whether a faint "
+        "candidate is in every roll and looks like a point source, and check the filter, the masks "
+        "and the date of the wavefront map. For a star with a disk, use the option disk."
     ),
     Status.PRIOR_MISMATCH: (
-        "The errors have been scaled to the scatter in the S/N map. Repeat the reduction with a "
-        "wavefront map nearer in time or, in Python, with WavefrontPrior(fit_scales=True), which "
+        "Errors of candidates are scaled to the scatter in the S/N map. Repeat the reduction with "
+        "a wavefront map nearer in time or, in Python, with WavefrontPrior(fit_scales=True), which "
         "lets the data determine how much the wavefront may change."
     ),
     Status.ITERATION_LIMIT: (
-        "Look at the history of the fit. If chi-squared was still falling, repeat the fit with a "
-        "larger max_iterations; if it hardly changed, try a wavefront map nearer in time."
+        "The result is the best iterate. If chi-squared was still falling in the history of the "
+        "fit, repeat it with more steps, such as GaussNewton.nircam(max_iterations=80); if it "
+        "hardly changed, try a wavefront map nearer in time."
     ),
     Status.DIVERGED: (
         "Do not use this result. Check the unit and orientation of the wavefront map, the position "
@@ -264,8 +265,13 @@ class Picture:
 
     name: str  # of its file, without the ending
     figure: Any  # of matplotlib
-    alt: str  # description of the picture, for readers who do not see it
-    caption: str
+    description: str  # a sentence, also for readers who do not see the picture
+    details: str = ""  # further sentences of the caption
+
+    @property
+    def caption(self) -> str:
+        """The description with the details."""
+        return f"{self.description} {self.details}".rstrip()
 
     @cached_property
     def uri(self) -> str:

@@ -29,7 +29,7 @@ from pyklip_diffrender.imaging import SkyModel
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.units import rotation_matrix
-from pyklip_diffrender.reduction.pages import Picture, number, plus_minus, scientific
+from pyklip_diffrender.reduction.pages import Picture, number, plus_minus
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.scene.observation import Window
@@ -309,18 +309,13 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     count = len(summary["candidates"])
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'}"
     some += f" above S/N {summary['threshold_snr']:g}"
-    places = "; ".join(
-        f"S/N {row['snr']:.1f} at {row['separation_arcsec']:.2f} arcsec"
-        for row in summary["candidates"]
-    )
     up = "north up" if summary["oriented"] else "oriented like the first frame"
     separations = [row["separation_arcsec"] for row in summary["limits"]]
     ours, theirs = overview.kept(separations)
     words = {
         "without_star": (
-            f"Image of {summary['target']} without the star, all frames combined, {up}.",
-            f"Mean of all frames minus the star, {up}. "
-            + _kept("A faint source keeps", ours, separations, " (THROUGHPUT in images.fits)")
+            f"Mean of all frames minus the star, {up}.",
+            _kept("A faint source keeps", ours, separations, " (THROUGHPUT in images.fits)")
             + (
                 "A candidate, which was fitted together with the star, keeps all of its light. "
                 "Circles mark the candidates. "
@@ -330,23 +325,21 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
             + "The scale is linear near 0 and logarithmic beyond.",
         ),
         "most_probable": (
-            f"Most probable image of the sky about {summary['target']}, {up}.",
             f"Most probable image of the sky without star and detector, {up}, from all frames and "
-            "on the same scale. Point sources have 0.4 to 1 of their peak, least close to the "
+            "on the same scale.",
+            "Point sources have 0.4 to 1 of their peak, least close to the "
             "star, and no side lobes.",
         ),
         "snr": (
-            "Map of the signal-to-noise ratio of a point source, "
-            f"{some}{': ' if places else ''}{places}.",
-            f"S/N of a point source at every pixel, {some}. The scale is linear within ±5.",
+            f"S/N of a point source at every pixel, {some}.",
+            "The scale is linear within ±5.",
         ),
     }
     if overview.klip is not None and theirs is not None:
         label = overview.klip.label
         words["klip"] = (
-            f"Image of the same frames after {label}.",
-            f"Mean of the same frames after {label}, on the same scale. "
-            + _kept("Any source, a candidate too, keeps about", theirs, separations),
+            f"Mean of the same frames after {label}, on the same scale.",
+            _kept("Any source, a candidate too, keeps about", theirs, separations),
         )
     figures, axes = _panels(len(overview.panels))
     for ax, panel in zip(axes, overview.panels, strict=True):
@@ -372,10 +365,6 @@ def _curve(
 ) -> list[Picture]:
     """The contrast curve, with that of KLIP if it is known."""
     detection = reduction.detection
-    limits = "; ".join(
-        f"{row['contrast']:.1e} at {row['separation_arcsec']:.3g} arcsec"
-        for row in summary["limits"]
-    )
     sigmas = summary["contrast_curve"]["sigmas"]
     dotted = (
         " Dotted: with the small-sample correction."
@@ -395,29 +384,26 @@ def _curve(
         [figure],
         ["contrast_curve"],
         (
-            f"Curve of the contrast at {sigmas:g} sigma against separation in arcsec"
-            f"{': ' if limits else ''}{limits}.",
-            f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
-            "median of all position angles and their range. Dashed: the limit for "
-            f"an exactly known star.{beside}{dotted} {_scaled(detection)}",
+            f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}, "
+            "against separation: the median of all position angles and their range.",
+            f"Dashed: the limit for an exactly known star.{beside}{dotted} {_scaled(detection)}",
         ),
     )
 
 
 def _candidate(detection: Detection, place: int) -> list[Picture]:
     """Pixels in every frame, flux and position of a candidate, by its place in the table."""
-    row, number = detection.candidates[place], place + 1
+    number = place + 1
     unit = drawing.unit_label(detection.observation.unit)
     stamps = _stamps(detection, place)
     pictures = [
         Picture(
             f"candidate_{number}_frame_{frame}",
             drawing.stamp_panels(stamp, unit),
-            f"Pixels about candidate {number} in frame {frame}: data, data without the star, model "
-            "of the source, and residual.",
-            f"Frame {frame}{_roll(stamp.north)}: the data; without star, background and other "
-            "candidates; the model of the source, on the same scale; and what is left, in standard "
-            "deviations of the noise. The cross marks the fitted position.",
+            f"Candidate {number} in frame {frame}{_roll(stamp.north)}: the data; without star, "
+            "background and other candidates; the model of the source, on the same scale; and what "
+            "is left, in standard deviations of the noise.",
+            "The cross marks the fitted position.",
         )
         for frame, stamp in stamps.items()
     ]
@@ -434,11 +420,9 @@ def _candidate(detection: Detection, place: int) -> list[Picture]:
     corner = Picture(
         f"candidate_{number}_corner",
         figure,
-        f"Gaussian of contrast and position of candidate {number}: contrast "
-        f"{scientific(row['contrast'], row['contrast_error'])}, {names[0]} {titles[1]} mas, "
-        f"{names[1]} {titles[2]} mas.",
-        "Contrast and position by the covariance of the fit, with the star and the other "
-        "candidates marginalised. Ellipses have one and two standard deviations, 39 and 86 % of "
+        f"Contrast and position of candidate {number} by the covariance of the fit, with the star "
+        "and the other candidates marginalised.",
+        "Ellipses have one and two standard deviations, 39 and 86 % of "
         "the probability. Errors include those of the star's flux and position.",
     )
     return [*pictures, corner]
@@ -548,17 +532,14 @@ def _wide(wide: WideField) -> list[Picture]:
         figures,
         ["whole_frames_snr", "whole_frames_contrast_curve"],
         (
-            f"Map of the signal-to-noise ratio of a point source in the whole frames, {some}.",
-            f"S/N of a point source in the whole frames, {up}: {nx} × {ny} pixels, at most the "
-            "field of the mask, 20 arcsec wide. Circles have the numbers of the table. About the "
+            f"S/N of a point source in the whole frames, {some}, {up}: {nx} × {ny} pixels, at most "
+            "the field of the mask, 20 arcsec wide.",
+            "Circles have the numbers of the table. About the "
             "star it is that of the search above; elsewhere the star, extrapolated from its fit, "
             "and the background were subtracted. Errors follow the scatter of the S/N at every "
             "separation.",
         ),
-        (
-            "Curve of the contrast limit against separation in arcsec, to the edge of the frames.",
-            "Contrast limit to the edge of the frames, as far as half of a ring is in them.",
-        ),
+        ("Contrast limit to the edge of the frames, as far as half of a ring is in them.",),
     )
 
 
@@ -570,13 +551,11 @@ def _disk(disk: Disk) -> list[Picture]:
         figures,
         ["extended_light", "extended_light_model"],
         (
-            "Image of the extended light: the frames without the star.",
-            "Frames minus the star, turned to the orientation of the first one and averaged. "
+            "Frames minus the star, turned to the orientation of the first one and averaged.",
             "The star was fitted together with the extended light, which therefore is not "
             "subtracted with it.",
         ),
         (
-            "Image of the extended light that was fitted.",
             "Light of the non-negative sources that were fitted together with the star, as the "
             "coronagraph shows it in the first frame.",
         ),
@@ -591,10 +570,8 @@ def _injections(planets: QTable) -> list[Picture]:
         [figure],
         ["injected_planets"],
         (
-            f"Recovered over injected contrast of {len(planets)} planets against separation in "
-            "arcsec, with error bars.",
-            "Recovered over injected contrast. Filled: detected. Open: not detected, and measured "
-            "at the known place.",
+            f"Recovered over injected contrast of {len(planets)} planets against separation.",
+            "Filled: detected. Open: not detected, and measured at the known place.",
         ),
     )
 
@@ -608,9 +585,8 @@ def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
         [figure],
         ["completeness"],
         (
-            "Fraction of planets that the search finds, by contrast and separation in arcsec.",
-            "Fraction of planets that the search finds. Dashed: 50 %; solid: 95 %; dotted: "
-            "the contrast curve at 5 sigma.",
+            "Fraction of planets that the search finds, by contrast and separation.",
+            "Dashed: 50 %; solid: 95 %; dotted: the contrast curve at 5 sigma.",
         ),
     )
 
@@ -631,19 +607,13 @@ def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
         _of_frame(detection, frame),
         [f"frame_{frame + 1}_{each}" for each in ("data", "model", "residual")],
         (
-            f"Image of {observation.target} behind the coronagraph, in {unit}.",
-            f"Observed{mean}. The scale is linear near 0 and logarithmic in bright parts; "
-            "the cross marks the star.",
+            f"Image of {observation.target} behind the coronagraph{mean}, in {unit}.",
+            "The scale is linear near 0 and logarithmic in bright parts; the cross marks the star.",
         ),
+        ("The fitted star and background, on the same scale.",),
         (
-            f"Modelled image of {observation.target}, in {unit}.",
-            "The fitted star and background, on the same scale.",
-        ),
-        (
-            f"The residual image of {observation.target} without the star, in standard "
-            "deviations of the noise.",
-            "Data without the star, over the noise of each pixel; the scale is linear within ±5."
-            f"{subtracted}",
+            "Data without the star, over the noise of each pixel.",
+            f"The scale is linear within ±5.{subtracted}",
         ),
     )
 
@@ -662,17 +632,11 @@ def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[P
     return _pictures(
         figures,
         [f"wavefront_{each}" for each in ("before", "after", "change")],
+        (f"The wavefront map that the fit started from ({about['name']}), {rms[0]} rms.",),
+        (f"The wavefront of the first frame after the fit, {rms[1]} rms.",),
         (
-            f"Map of the wavefront error before the fit, {rms[0]} rms.",
-            f"The map that the fit started from ({about['name']}), {rms[0]} rms.",
-        ),
-        (
-            f"Map of the wavefront error after the fit, {rms[1]} rms.",
-            f"The wavefront of the first frame after the fit, {rms[1]} rms.",
-        ),
-        (
-            f"Map of the change of the wavefront error, {rms[2]} rms.",
-            f"After minus before, {rms[2]} rms. The frames measure only what the Lyot stop lets "
+            f"Change of the wavefront, after minus before: {rms[2]} rms.",
+            "The frames measure only what the Lyot stop lets "
             "through and what reaches the fitted pixels; the rest follows from the prior.",
         ),
     )
@@ -711,10 +675,8 @@ def _panels(count: int) -> tuple[list[Any], list[Any]]:
     return [figure for figure, _ in panels], [ax for _, ax in panels]
 
 
-def _pictures(
-    figures: Sequence[Any], names: Sequence[str], *words: tuple[str, str]
-) -> list[Picture]:
+def _pictures(figures: Sequence[Any], names: Sequence[str], *words: Sequence[str]) -> list[Picture]:
     return [
-        Picture(name, figure, alt, caption)
-        for name, figure, (alt, caption) in zip(names, figures, words, strict=True)
+        Picture(name, figure, *text)
+        for name, figure, text in zip(names, figures, words, strict=True)
     ]

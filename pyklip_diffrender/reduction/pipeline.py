@@ -49,6 +49,7 @@ from pyklip_diffrender.pattern import (
     fit_with_pattern,
     is_known_beside,
 )
+from pyklip_diffrender.reduction.pages import advice
 from pyklip_diffrender.reduction.visit import (
     Contribution,
     Joined,
@@ -59,6 +60,7 @@ from pyklip_diffrender.reduction.visit import (
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
+    Status,
     coarse_arguments,
     quick_settings,
     refine,
@@ -98,22 +100,6 @@ MAX_CHI2 = 100.0
 """Default of the largest reduced chi-squared of a plausible fit. Fits of real frames have 0.5 to 6,
 12 with a bright disk; with a star in the wrong place it is in the thousands."""
 
-_ADVICE = {
-    "MODEL_MISMATCH": (
-        "check the filter, the masks and the date of the wavefront map. Where the flat-field "
-        "pattern is not known, add reference frames (systematics='references'); for a star with a "
-        "disk, set disk=True"
-    ),
-    "PRIOR_MISMATCH": (
-        "take a wavefront map nearer in time, or let the scales of the prior be fitted "
-        "(WavefrontPrior(fit_scales=True))"
-    ),
-    "ITERATION_LIMIT": (
-        "the best iterate was subtracted. Raise max_iterations, for example "
-        "fit=GaussNewton.nircam(max_iterations=80)"
-    ),
-}
-
 
 def require_plausible(name: str, result: Refinement, limit: float) -> None:
     """Raise RefinementError for a fit that failed, or has nothing to do with the frames."""
@@ -140,12 +126,12 @@ def reduced_chi2(result: Refinement) -> float:
 
 def warn_of_status(name: str, result: Refinement) -> None:
     """Warn of a fit that is usable but has not converged, and say what to do about it."""
-    advice = _ADVICE.get(result.status.name)
-    if advice is not None:
+    if result.status is not Status.CONVERGED:
+        todo = advice(result.status, patterned=result.systematics is not None)
         warnings.warn(
             f"{name}: the fit ended as {result.status} (chi-squared per pixel "
-            f"{result.chi2_per_pixel:.3g}). What to do: {advice}. See "
-            "'Reading a status' in the documentation",
+            f"{result.chi2_per_pixel:.3g}). What to do: {todo} See 'Reading a status' in the "
+            "documentation",
             DiffrenderWarning,
             stacklevel=2,
         )

@@ -103,7 +103,6 @@ def _thumbnails(folders: Mapping[str, Mapping[str, Any]], above: Path) -> list[P
             Picture(
                 name,
                 figure,
-                f"Map of the signal-to-noise ratio of a point source, {_name(summary)}, {some}.",
                 f"{_name(summary)}: S/N of a point source, {some}, numbered as in the table.",
             )
         )
@@ -145,11 +144,9 @@ def _tracks(combination: Combination) -> list[Picture]:
             Picture(
                 f"track_{number}",
                 figure,
-                f"Offsets of candidate {number} of the combined search from the star at each "
-                "epoch, and the way of a source in the background.",
                 f"Candidate {number} of the combined search, filled, and where a source in the "
-                "background would be at the other dates, open and connected by the dashed line. A "
-                "companion stays, apart from its orbit.",
+                "background would be at the other dates, open and connected by the dashed line.",
+                "A companion stays, apart from its orbit.",
             )
         )
     return pictures

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.io.headers import known_number, known_text
+from pyklip_diffrender.io.tables import labelled, plain_rows
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction.pages import advice, sentence
@@ -78,7 +79,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
             "chi2_per_pixel": fit.chi2_per_pixel,
             "model_error": fit.model_error,
             "error_factor": detection.scatter,
-            "rings": _rows(detection.rings),
+            "rings": plain_rows(detection.rings),
         },
         "wavefront_map": _wavefront_map(fit, first),
         "systematics": _systematics(reduction),
@@ -100,7 +101,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
             *(_frame(each, uses.get(each.name, "not used")) for each in sequence.references),
         ],
         "visit": {"gain": reduction.visit.gain, "contributions": contributions},
-        "admission": _rows(sequence.table),
+        "admission": plain_rows(sequence.table),
         "left_out": [
             *({"name": name, "reason": reason} for name, reason in sequence.excluded),
             *({"name": f"reference star {n}", "reason": why} for n, why in reduction.failed),
@@ -178,23 +179,9 @@ def _star(detection: Detection) -> dict[str, Any] | None:
     }
 
 
-def _label(table: QTable, name: str) -> str:
-    """Name of a column with its unit; those of magnitudes include it."""
-    unit = table[name].unit
-    return name if unit in (None, u.mag) else f"{name}_{unit}"
-
-
-def _rows(table: QTable) -> list[dict[str, Any]]:
-    """The rows of a table, with the unit in the names."""
-    return [
-        {_label(table, name): getattr(row[name], "value", row[name]) for name in table.colnames}
-        for row in table
-    ]
-
-
 def _candidates(reduction: ReductionResult) -> list[dict[str, Any]]:
     """Candidates; those that look like extended light have no false-alarm probability."""
-    rows = _rows(reduction.detection.candidates)
+    rows = plain_rows(reduction.detection.candidates)
     if reduction.extended:
         rows = [each | {"false_alarm_probability": None} for each in rows]
     return rows
@@ -202,7 +189,10 @@ def _candidates(reduction: ReductionResult) -> list[dict[str, Any]]:
 
 def _wide_field(wide: WideField) -> dict[str, Any]:
     """Candidates and limits in the whole frames."""
-    return {"candidates": _rows(wide.candidates), "contrast_curve": _curve(wide.contrast_curve)}
+    return {
+        "candidates": plain_rows(wide.candidates),
+        "contrast_curve": _curve(wide.contrast_curve),
+    }
 
 
 def _disk(disk: Disk) -> dict[str, Any]:
@@ -232,7 +222,7 @@ def _injected(planets: QTable) -> dict[str, Any]:
         "pull_deviation": pull.std(ddof=1) if several else None,
         "within_one_error": np.mean(np.abs(pull) < 1),
         "strength": planets.meta["strength"],
-        "planets": _rows(planets),
+        "planets": plain_rows(planets),
     }
 
 
@@ -250,7 +240,7 @@ def _completeness(reduction: ReductionResult) -> dict[str, Any] | None:
 
 
 def _curve(curve: QTable) -> dict[str, Any]:
-    columns = {_label(curve, name): np.asarray(curve[name]) for name in curve.colnames}
+    columns = {labelled(curve, name): np.asarray(curve[name]) for name in curve.colnames}
     return {"sigmas": curve.meta["sigmas"], **columns}
 
 

@@ -34,10 +34,11 @@ from scipy.stats import chi2
 from pyklip_diffrender.detection import (
     Detection,
     ReferenceSource,
-    contrast_curve,
     detect,
     sources_of_references,
 )
+from pyklip_diffrender.detection.field import ring_pixels
+from pyklip_diffrender.detection.templates import groups_of, weigh
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
@@ -501,14 +502,20 @@ def _with_companions_masked(
 
 def _gain(alone: Refinement, joint: Refinement) -> float:
     """Limits of one fit over those of another, in units of flux, the median over separations."""
-    # In units of flux, because the two fits may differ in that of the star.
-    curves = []
-    for fit in (alone, joint):
-        edge = float(np.abs(fit.frames[0].grid).max())
-        separations = [each for each in _SEPARATIONS if each < edge] or [edge / 2]
-        curve = contrast_curve(fit, separations, angles=_ANGLES, scatter=1.0)
-        curves.append(fit.frames[0].flux * np.asarray(curve["contrast"]))
-    return float(np.nanmedian(curves[0] / curves[1]))
+    return float(np.nanmedian(_flux_errors(alone) / _flux_errors(joint)))
+
+
+def _flux_errors(fit: Refinement) -> NDArray[np.float64]:
+    """Errors of the fluxes of point sources, the medians of `_ANGLES` places at each separation."""
+    # Errors of contrasts cannot be compared: the fits may differ in the flux of the star.
+    groups, edge = groups_of([fit]), float(np.abs(fit.frames[0].grid).max())
+    separations = [each for each in _SEPARATIONS if each < edge] or [edge / 2]
+    rings = ring_pixels(groups[0][1].grid, np.array(separations), _ANGLES)
+    rows, columns = np.concatenate(rings, axis=1)
+    products = weigh(groups, lambda templates: templates.at_pixels(rows, columns))
+    ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
+    errors = np.split(products.information.numpy() ** -0.5, ends)
+    return fit.frames[0].flux * np.array([np.median(each) for each in errors if len(each)])
 
 
 def _stated_gain(alone: Detection, joint: Detection) -> float:

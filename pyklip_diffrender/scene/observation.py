@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import full_circle, half_circle, rotation_matrix
 from pyklip_diffrender.scene.exposure import instrument_of, star_of
 from pyklip_diffrender.scene.integrations import (
@@ -520,20 +519,6 @@ class Observation:
         return (
             f"<Observation {self.name!r}: {len(self)} frame{'s' if len(self) > 1 else ''} of "
             f"{nx} x {ny} pixels, {self.filter or 'no filter'}, {self.unit}, {day}>"
-        )
-
-    def _repr_html_(self) -> str:
-        ny, nx = self.shape
-        return html_summary(
-            f"Observation {self.name}",
-            {
-                "Star": f"{self.target}{' (reference)' if self.reference else ''}",
-                "Filter": self.filter,
-                "Date (UTC)": None if self.date is None else self.date.isot[:19],
-                "Frames": f"{len(self)} of {nx} x {ny} pixels, {self.unit}",
-                "Pixels used": f"{100 * self.valid.mean():.1f} %",
-                "Position angle of +y": None if self.north is None else f"{self.north:.2f} deg",
-            },
         )
 
     @property

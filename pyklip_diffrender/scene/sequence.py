@@ -16,7 +16,6 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.admission import (
     EPOCH,
     FrameFile,
@@ -206,10 +205,6 @@ class Sequence:
             f"<Sequence: {self.target} in {self.filter}, {len(self.science)} of the "
             f"target, {len(self.references)} of reference stars>"
         )
-
-    def _repr_html_(self) -> str:
-        facts = {"Filter": self.filter, "Left out": len(self.excluded) or None}
-        return html_summary(f"Sequence of {self.target}", facts, self.table, SHORT)
 
     @property
     def filter(self) -> str | None:

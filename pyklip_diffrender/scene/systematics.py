@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, ShapeError
 from pyklip_diffrender.io.files import open_fits, require_new, write_fits
 from pyklip_diffrender.io.headers import fits_text
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.exposure import (
     CatalogueStar,
@@ -273,19 +272,6 @@ class Systematics:
     def __repr__(self) -> str:
         ny, nx = self.pattern.shape
         return f"<Systematics {self.name!r}: {self.filter}, {nx} x {ny} pixels>"
-
-    def _repr_html_(self) -> str:
-        ny, nx = self.pattern.shape
-        return html_summary(
-            f"Systematics {self.name}",
-            {
-                "Filter": self.filter,
-                "Mask": self.image_mask,
-                "Pattern": f"{nx} x {ny} pixels, unmeasured ones {100 * self.unknown:.2g} %",
-                "Pedestal": f"{self.pedestal:.3g}" if self.pedestal else None,
-                "Stars": ", ".join(map(str, self.provenance.get("stars", ()))) or None,
-            },
-        )
 
     @property
     def stars(self) -> tuple[CatalogueStar, ...]:

@@ -285,10 +285,10 @@ def _pictures(rows: Rows) -> list[Picture]:
     picture = Picture(
         "contrast_curves",
         figure,
-        f"Curves of the contrast at {sigmas:g} sigma against separation in arcsec for "
-        f"{count(len(curves), 'sequence')}; the table has their values.",
-        f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
-        f"median of all position angles.{' Circles are candidates.' if candidates else ''}",
+        "Contrast, relative to the star without coronagraph, that gives S/N "
+        f"{sigmas:g}, against separation, for {count(len(curves), 'sequence')}: the median of all "
+        "position angles.",
+        "Circles are candidates." if candidates else "",
     )
     return [picture]
 

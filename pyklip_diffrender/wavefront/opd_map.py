@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import DiffrenderWarning, UnitError
 from pyklip_diffrender.io.headers import fits_text
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import require_finite, to_metres
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
 
@@ -57,23 +56,6 @@ class OPDMap:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.float64]:
         return np.array(self.data, dtype=dtype)
-
-    def _repr_html_(self) -> str:
-        return html_summary(
-            f"OPDMap {self.name}",
-            {
-                "Sensed (UTC)": None if self.date is None else self.date.isot[:19],
-                "Sensed at": self.aperture or None,
-                "Samples": " x ".join(map(str, self.shape)),
-                "Standard deviation": f"{1e9 * self._inside.std():.1f} nm",
-            },
-        )
-
-    @property
-    def _inside(self) -> NDArray[np.float64]:
-        """The values that are not 0; a single 0 if there are none."""
-        values = self.data[self.data != 0]
-        return values if len(values) else np.zeros(1)
 
     @property
     def shape(self) -> tuple[int, ...]:

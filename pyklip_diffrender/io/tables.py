@@ -1,0 +1,43 @@
+"""Tables whose columns have units, formats and descriptions, and their rows as plain values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable, Table
+
+__all__ = ["Column", "add_columns", "labelled", "plain_rows"]
+
+Column = tuple[str, Any, Any, str, str]
+"""Name, values, unit or None, format and description; the last two may be empty."""
+
+
+def add_columns(table: QTable, columns: Iterable[Column]) -> QTable:
+    """Add columns to a table, replacing those of the same name, and return it."""
+    for name, values, unit, form, about in columns:
+        table[name] = values if unit is None else values * unit
+        table[name].info.format = form or None
+        table[name].info.description = about or None
+    return table
+
+
+def labelled(table: Table, name: str) -> str:
+    """Name of a column with its unit, which the names of magnitudes include already."""
+    unit = table[name].unit
+    return name if unit in (None, u.mag) else f"{name}_{unit}"
+
+
+def plain_rows(table: Table) -> list[dict[str, Any]]:
+    """Rows of a table as JSON has them, with the unit in the names; None for what is not known."""
+    names = {name: labelled(table, name) for name in table.colnames}
+    return [{label: _plain(row[name]) for name, label in names.items()} for row in table]
+
+
+def _plain(cell: Any) -> Any:
+    value = getattr(cell, "value", cell)
+    value = value.item() if isinstance(value, np.generic | np.ndarray) else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
