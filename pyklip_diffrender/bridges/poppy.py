@@ -23,7 +23,7 @@ from pyklip_diffrender.io.units import ARCSEC, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.planes import Detector
-from pyklip_diffrender.optics.system import OpticalSystem, poppy_psf
+from pyklip_diffrender.optics.system import OpticalSystem, poppy_psf, refuse_keywords
 
 __all__ = [
     "PoppySystem",
@@ -31,7 +31,6 @@ __all__ = [
     "from_poppy",
     "intermediate_wavefronts",
     "opd_to_poppy",
-    "refuse_saving",
 ]
 
 
@@ -128,7 +127,16 @@ def _wave_of(
 
 # `from_poppy`: make a differentiable system of a poppy `OpticalSystem`, and export wavefronts.
 
-_POPPY_OPTIONS = ("display_intermediates", "progressbar")
+REFUSED = {
+    "save_intermediates": "this system writes no files of its own; pass return_intermediates=True "
+    "and call .writeto() on the wavefronts",
+    "display_intermediates": "display=True draws the PSF alone; pass return_intermediates=True and "
+    "call .display() on the wavefronts",
+    "progressbar": "a PSF of this system is not made in steps that take long; leave it out",
+    "inwave": "the entrance pupil makes the field of this system; give a wavefront as opd, and the "
+    "place of the source as star_offset",
+}
+"""Keywords of poppy's `calc_psf` that a converted system does not serve, and why."""
 
 _COPIES = 4
 """How many copies with other settings are cached; a fit asks for the same ones repeatedly."""
@@ -241,8 +249,11 @@ class PoppySystem(OpticalSystem):
         return_final: bool = False,
         source: dict[str, Any] | None = None,
         normalize: str = "first",
+        display_intermediates: bool = False,
+        progressbar: bool = False,
+        inwave: poppy.Wavefront | None = None,
         opd: Any = None,
-        **options: Any,
+        **parameters: Any,
     ) -> Any:
         """PSF as an HDUList, with the arguments and the keywords of poppy's `calc_psf`.
 
@@ -259,37 +270,38 @@ class PoppySystem(OpticalSystem):
         return_intermediates, return_final : bool
             Also return a list of `poppy.Wavefront`: one for every pupil plane and the detector,
             or the one on the detector. They are summed over wavelengths as poppy does.
-        opd, **options
-            As in a call of the system. Options of poppy's that have no meaning here are dropped.
-        save_intermediates, save_intermediates_what, display
-            Accepted for compatibility with poppy. Nothing is drawn, and saving is refused with a
-            pointer to `return_intermediates`.
+        display : bool
+            Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
+        opd, **parameters
+            As in a call of the system.
+        save_intermediates, display_intermediates, progressbar, inwave
+            Refused with a pointer to what does the same.
+        save_intermediates_what
+            Without effect, as in poppy where no intermediate planes are saved.
 
         Returns
         -------
         HDUList, or (HDUList, list of Wavefront)
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a keyword of poppy's that this system does not serve, with the reason, and for an
+            unknown `normalize`.
         """
-        refuse_saving(save_intermediates)
+        refuse_keywords(REFUSED, locals())
         if source is not None:
             wavelength, weight = source["wavelengths"], source["weights"]
         system: Any = self
         if wavelength is not None:
             system = self.with_fidelity(wavelength=wavelength, weights=weight)
-        parameters = {k: v for k, v in options.items() if k not in _POPPY_OPTIONS}
         hdus = poppy_psf(system, normalize, opd, **parameters)
+        if display:
+            system.draw_psf(hdus, parameters)
         if not (return_intermediates or return_final):
             return hdus
         return hdus, intermediate_wavefronts(
             system, system.frames, normalize, only_last=not return_intermediates
-        )
-
-
-def refuse_saving(save_intermediates: bool) -> None:
-    """Raise for poppy's option to write every intermediate plane to a file."""
-    if save_intermediates:
-        raise IncompatibleSetupError(
-            "save_intermediates: this system writes no files on its own; pass "
-            "return_intermediates=True and call .writeto() on the wavefronts"
         )
 
 
