@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.image_masks import FourierMask, SampledOcculter
-from pyklip_diffrender.bridges.sampled_planes import Orientation, PupilOptic
+from pyklip_diffrender.bridges.sampled_planes import Orientation
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -138,9 +138,6 @@ REFUSED = {
 }
 """Keywords of poppy's `calc_psf` that a converted system does not serve, and why."""
 
-_COPIES = 4
-"""How many copies with other settings are cached; a fit asks for the same ones repeatedly."""
-
 _SUPPORTED = (
     "pupil and image planes of any optic with a transmission and an OPD, coordinate "
     "inversions and rotations in pupils, and a Detector at the end"
@@ -150,8 +147,8 @@ _SUPPORTED = (
 class PoppySystem(OpticalSystem):
     """An `OpticalSystem` made from poppy's, with its names and interface; see `Conversion`."""
 
-    _sources: ClassVar[tuple[str, ...]] = ("osys", "trainable")
-    """Arguments that define the system, as opposed to settings of it."""
+    _source: ClassVar[str] = "osys"
+    """Argument that defines the system, as opposed to settings of it."""
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **OpticalSystem._replaced,
         "wavelength": ("weights",),
@@ -174,16 +171,15 @@ class PoppySystem(OpticalSystem):
         )
         self.propagation, self.frames = conversion.propagation, conversion.frames
         self._fixed = conversion.fixed
-        self._copies: dict[frozenset[tuple[str, Any]] | None, OpticalSystem] = {}
 
     @property
     def adjustable(self) -> frozenset[str]:
         """See `OpticalSystem.adjustable`.
 
-        Without "npix" if planes are trainable, and without "occulter_sampling" if a mask depends
-        on poppy's own sampling of the image (four-quadrant masks).
+        Without "occulter_sampling" if a mask depends on poppy's own sampling of the image
+        (four-quadrant masks).
         """
-        return frozenset({*self.recipe, "bandpass"} - {*self._sources, *self._fixed})
+        return frozenset({*self.recipe, "bandpass"} - {self._source, *self._fixed})
 
     def _band(self, bandpass: Bandpass) -> dict[str, Any]:
         """Arguments of `from_poppy` for a bandpass."""
@@ -194,49 +190,6 @@ class PoppySystem(OpticalSystem):
         if set(bandpass.wavelengths) <= set(self.bandpass.wavelengths):
             return super().at_wavelengths(bandpass)
         return self._remade(self._band(bandpass))
-
-    def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
-        key: frozenset[tuple[str, Any]] | None
-        try:
-            key = frozenset(changes.items())
-        except TypeError:
-            key = None  # Arrays, for example, cannot be looked up.
-        if key in self._copies:
-            return self._copies[key]
-        system = super()._remade(changes)
-        assert isinstance(system, PoppySystem)
-        for name, (opd, transmission) in self.trainable.items():
-            # Share the tensors, so that training one system trains the other.
-            plane = system.plane(name)
-            plane.opd, plane.transmission = opd, transmission
-        if key is not None:
-            while len(self._copies) >= _COPIES:
-                del self._copies[next(iter(self._copies))]
-            self._copies[key] = system
-        return system
-
-    def plane(self, name: str) -> Any:
-        """The plane with this name; KeyError if there is none."""
-        planes: list[Any] = [self.entrance, *self.planes, self.detector]
-        for plane in planes:
-            if plane.name == name:
-                return plane
-        names = [plane.name for plane in planes]
-        raise KeyError(f"{name!r} is not a plane of this system; those are {names}")
-
-    @property
-    def trainable(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """The leaf tensors (OPD change in m, transmission factor) of every trainable plane.
-
-        Systems that `with_fidelity` makes share them.
-        """
-        return {
-            plane.name: (plane.opd, plane.transmission)
-            for plane in self.planes
-            if isinstance(plane, PupilOptic)
-            and plane.opd is not None
-            and plane.transmission is not None
-        }
 
     def calc_psf(  # type: ignore[override]  # As an OpticalSystem of poppy, not an Instrument.
         self,
@@ -314,7 +267,6 @@ def from_poppy(
     occulter_sampling: float | None = None,
     npix: int | None = None,
     fov_pixels: int | tuple[int, int] | None = None,
-    trainable: Collection[str] = (),
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
 ) -> PoppySystem:
@@ -347,8 +299,6 @@ def from_poppy(
         over blocks. Default poppy's own.
     fov_pixels : int or (ny, nx), optional
         Detector pixels; default those of the system's detector.
-    trainable : collection of str
-        Names of pupil planes that get leaf tensors to train, see ``model.trainable``.
     dtype : torch.dtype
         torch.float64 or torch.float32.
     device : str or torch.device

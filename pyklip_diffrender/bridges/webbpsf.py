@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -273,7 +273,7 @@ class WebbSystem(PoppySystem):
     # Whether the map of the instrument's internal wavefront error is flipped vertically, as stpsf
     # does from 2.2.0 on; None without one.
     si_wfe_flipped: bool | None
-    _sources: ClassVar[tuple[str, ...]] = ("nircam", "trainable")
+    _source: ClassVar[str] = "nircam"
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **PoppySystem._replaced,
         "monochromatic": ("bandpass",),
@@ -400,7 +400,6 @@ def from_webbpsf(
     propagation: str | Mapping[str, str] = "auto",
     occulter_sampling: float | None = None,
     npix: int | None = None,
-    trainable: Collection[str] = (),
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
 ) -> WebbSystem:
@@ -428,7 +427,7 @@ def from_webbpsf(
     flip_si_wfe : bool, optional
         Whether to flip the coronagraph's internal wavefront error vertically; default as in the
         installed stpsf, which flips it from 2.2.0 on. See ``model.si_wfe_flipped``.
-    propagation, occulter_sampling, npix, trainable, dtype, device
+    propagation, occulter_sampling, npix, dtype, device
         See `from_poppy`; the default sampling is `fft_oversample`, the default `npix` that of
         ``nircam.pupil``.
 
