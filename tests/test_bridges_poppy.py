@@ -246,27 +246,6 @@ def test_there_and_back():
         opd_to_poppy(opd[:-1], system)
 
 
-def test_planes_become_trainable_on_request():
-    system = make(PUPIL, ("invert", "y"), ZERNIKES, SPOT, STOP)
-    model = from_poppy(system, WAVELENGTH, trainable=("aberrations",))
-    opd, transmission = model.trainable["aberrations"]
-    assert list(model.trainable) == ["aberrations"]
-    truth = from_poppy(system, WAVELENGTH)()
-    assert relative(model().detach().numpy(), truth.numpy()) < 1e-14
-    model().square().sum().backward()
-    assert opd.grad.abs().max() > 0
-    assert transmission.grad is not None
-    # The tensors have the frame of their own plane: poppy agrees on a change of it.
-    change = reference.lopsided_opd(NPIX)
-    with torch.no_grad():
-        opd += torch.from_numpy(change)
-    extra = {"opd": change, "pixelscale": 6.5 / NPIX * u.m / u.pix, "planetype": PlaneType.pupil}
-    system.add_pupil(poppy.ArrayOpticalElement(name="extra", transmission=1 + 0 * change, **extra),
-                     index=3)  # fmt: skip
-    truth_changed = from_poppy(system, WAVELENGTH)()
-    assert relative(model().detach().numpy(), truth_changed.numpy()) < 1e-12
-
-
 def test_single_precision():
     system = make(PUPIL, SPOT, STOP)
     truth = from_poppy(system, WAVELENGTH)().numpy()

@@ -202,7 +202,7 @@ def test_sampled_planes():
         system.add_image(poppy.BandLimitedCoron(kind="circular", sigma=5.0))
         system.add_pupil(poppy.SecondaryObscuration(secondary_radius=0.7))
         system.add_detector(pixelscale=0.06, fov_pixels=SIZE)
-        model = from_poppy(system, 4.5e-6, trainable=("aberrations",), device=device)
+        model = from_poppy(system, 4.5e-6, device=device)
         return [model(opd(), (0.02, 0.01)).detach().cpu().numpy()]
 
     agree(rendered, rtol=1e-9)

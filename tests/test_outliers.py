@@ -13,9 +13,7 @@ SIZE, NPIX, SCENE = 32, 64, 5
 PIXEL = (9, 21)
 """Row and column of the bad pixel, 0.55 arcsec from the star."""
 
-SETTINGS = dr.GaussNewton(
-    cycles=6.0, response_npix=NPIX, companions_if_stalled=False, coarse_first=False
-)
+SETTINGS = dr.GaussNewton(cycles=6.0, response_npix=NPIX, companions_if_stalled=False)
 """With a model error that is allowed for, fits do not look for companions by themselves."""
 
 

@@ -89,7 +89,7 @@ class Conversion:
         # For every image plane, "compact" or "fft".
         self.propagation: dict[str, str] = {}
         # Settings that cannot be changed without changing what the system computes.
-        self.fixed: set[str] = {"npix", "device"} if recipe["trainable"] else set()
+        self.fixed: set[str] = set()
         self._has_stop = False
         # For every plane of poppy's, from its frame to the frame of the system's pupils.
         turns = turns_behind(osys.planes)
@@ -219,14 +219,13 @@ class Conversion:
             phasors[wavelength], latest = tensor, phasor
         assert latest is not None
         centred = wave._image_centered
-        trainable = optic.name in self.recipe["trainable"]
         uniform = latest.size == 1 or np.ptp(latest) == 0
-        if uniform and not trainable and len({id(p) for p in phasors.values()}) == 1:
+        if uniform and len({id(p) for p in phasors.values()}) == 1:
             return Gain(optic.name, complex(latest.flat[0])), centred
-        # The first stop behind a mask becomes a `MovableStop`, unless it is trainable.
+        # The first stop behind a mask becomes a `MovableStop`.
         kind = self.kinds.get(optic.name, PupilOptic)
         behind_mask = any(p.planetype == PlaneType.image for p in self.osys.planes[:index])
-        if kind is PupilOptic and behind_mask and not (self._has_stop or trainable):
+        if kind is PupilOptic and behind_mask and not self._has_stop:
             # An optic with a constant amplitude is not a stop.
             self._has_stop = bool(np.ptp(np.abs(latest)) > 1e-9)
             kind = MovableStop if self._has_stop else PupilOptic
@@ -238,7 +237,6 @@ class Conversion:
             self.device,
             optic.name,
             self.frames[index],
-            trainable,
         )
         return plane, centred
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,13 +17,13 @@ from torch import Tensor
 
 from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.image_masks import FourierMask, SampledOcculter
-from pyklip_diffrender.bridges.sampled_planes import Orientation, PupilOptic
+from pyklip_diffrender.bridges.sampled_planes import Orientation
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.planes import Detector
-from pyklip_diffrender.optics.system import OpticalSystem, poppy_psf
+from pyklip_diffrender.optics.system import OpticalSystem, poppy_psf, refuse_keywords
 
 __all__ = [
     "PoppySystem",
@@ -31,7 +31,6 @@ __all__ = [
     "from_poppy",
     "intermediate_wavefronts",
     "opd_to_poppy",
-    "refuse_saving",
 ]
 
 
@@ -128,10 +127,16 @@ def _wave_of(
 
 # `from_poppy`: make a differentiable system of a poppy `OpticalSystem`, and export wavefronts.
 
-_POPPY_OPTIONS = ("display_intermediates", "progressbar")
-
-_COPIES = 4
-"""How many copies with other settings are cached; a fit asks for the same ones repeatedly."""
+REFUSED = {
+    "save_intermediates": "this system writes no files of its own; pass return_intermediates=True "
+    "and call .writeto() on the wavefronts",
+    "display_intermediates": "display=True draws the PSF alone; pass return_intermediates=True and "
+    "call .display() on the wavefronts",
+    "progressbar": "a PSF of this system is not made in steps that take long; leave it out",
+    "inwave": "the entrance pupil makes the field of this system; give a wavefront as opd, and the "
+    "place of the source as star_offset",
+}
+"""Keywords of poppy's `calc_psf` that a converted system does not serve, and why."""
 
 _SUPPORTED = (
     "pupil and image planes of any optic with a transmission and an OPD, coordinate "
@@ -142,8 +147,8 @@ _SUPPORTED = (
 class PoppySystem(OpticalSystem):
     """An `OpticalSystem` made from poppy's, with its names and interface; see `Conversion`."""
 
-    _sources: ClassVar[tuple[str, ...]] = ("osys", "trainable")
-    """Arguments that define the system, as opposed to settings of it."""
+    _source: ClassVar[str] = "osys"
+    """Argument that defines the system, as opposed to settings of it."""
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **OpticalSystem._replaced,
         "wavelength": ("weights",),
@@ -166,16 +171,15 @@ class PoppySystem(OpticalSystem):
         )
         self.propagation, self.frames = conversion.propagation, conversion.frames
         self._fixed = conversion.fixed
-        self._copies: dict[frozenset[tuple[str, Any]] | None, OpticalSystem] = {}
 
     @property
     def adjustable(self) -> frozenset[str]:
         """See `OpticalSystem.adjustable`.
 
-        Without "npix" if planes are trainable, and without "occulter_sampling" if a mask depends
-        on poppy's own sampling of the image (four-quadrant masks).
+        Without "occulter_sampling" if a mask depends on poppy's own sampling of the image
+        (four-quadrant masks).
         """
-        return frozenset({*self.recipe, "bandpass"} - {*self._sources, *self._fixed})
+        return frozenset({*self.recipe, "bandpass"} - {self._source, *self._fixed})
 
     def _band(self, bandpass: Bandpass) -> dict[str, Any]:
         """Arguments of `from_poppy` for a bandpass."""
@@ -186,49 +190,6 @@ class PoppySystem(OpticalSystem):
         if set(bandpass.wavelengths) <= set(self.bandpass.wavelengths):
             return super().at_wavelengths(bandpass)
         return self._remade(self._band(bandpass))
-
-    def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
-        key: frozenset[tuple[str, Any]] | None
-        try:
-            key = frozenset(changes.items())
-        except TypeError:
-            key = None  # Arrays, for example, cannot be looked up.
-        if key in self._copies:
-            return self._copies[key]
-        system = super()._remade(changes)
-        assert isinstance(system, PoppySystem)
-        for name, (opd, transmission) in self.trainable.items():
-            # Share the tensors, so that training one system trains the other.
-            plane = system.plane(name)
-            plane.opd, plane.transmission = opd, transmission
-        if key is not None:
-            while len(self._copies) >= _COPIES:
-                del self._copies[next(iter(self._copies))]
-            self._copies[key] = system
-        return system
-
-    def plane(self, name: str) -> Any:
-        """The plane with this name; KeyError if there is none."""
-        planes: list[Any] = [self.entrance, *self.planes, self.detector]
-        for plane in planes:
-            if plane.name == name:
-                return plane
-        names = [plane.name for plane in planes]
-        raise KeyError(f"{name!r} is not a plane of this system; those are {names}")
-
-    @property
-    def trainable(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """The leaf tensors (OPD change in m, transmission factor) of every trainable plane.
-
-        Systems that `with_fidelity` makes share them.
-        """
-        return {
-            plane.name: (plane.opd, plane.transmission)
-            for plane in self.planes
-            if isinstance(plane, PupilOptic)
-            and plane.opd is not None
-            and plane.transmission is not None
-        }
 
     def calc_psf(  # type: ignore[override]  # As an OpticalSystem of poppy, not an Instrument.
         self,
@@ -241,8 +202,11 @@ class PoppySystem(OpticalSystem):
         return_final: bool = False,
         source: dict[str, Any] | None = None,
         normalize: str = "first",
+        display_intermediates: bool = False,
+        progressbar: bool = False,
+        inwave: poppy.Wavefront | None = None,
         opd: Any = None,
-        **options: Any,
+        **parameters: Any,
     ) -> Any:
         """PSF as an HDUList, with the arguments and the keywords of poppy's `calc_psf`.
 
@@ -259,37 +223,38 @@ class PoppySystem(OpticalSystem):
         return_intermediates, return_final : bool
             Also return a list of `poppy.Wavefront`: one for every pupil plane and the detector,
             or the one on the detector. They are summed over wavelengths as poppy does.
-        opd, **options
-            As in a call of the system. Options of poppy's that have no meaning here are dropped.
-        save_intermediates, save_intermediates_what, display
-            Accepted for compatibility with poppy. Nothing is drawn, and saving is refused with a
-            pointer to `return_intermediates`.
+        display : bool
+            Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
+        opd, **parameters
+            As in a call of the system.
+        save_intermediates, display_intermediates, progressbar, inwave
+            Refused with a pointer to what does the same.
+        save_intermediates_what
+            Without effect, as in poppy where no intermediate planes are saved.
 
         Returns
         -------
         HDUList, or (HDUList, list of Wavefront)
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a keyword of poppy's that this system does not serve, with the reason, and for an
+            unknown `normalize`.
         """
-        refuse_saving(save_intermediates)
+        refuse_keywords(REFUSED, locals())
         if source is not None:
             wavelength, weight = source["wavelengths"], source["weights"]
         system: Any = self
         if wavelength is not None:
             system = self.with_fidelity(wavelength=wavelength, weights=weight)
-        parameters = {k: v for k, v in options.items() if k not in _POPPY_OPTIONS}
         hdus = poppy_psf(system, normalize, opd, **parameters)
+        if display:
+            system.draw_psf(hdus, parameters)
         if not (return_intermediates or return_final):
             return hdus
         return hdus, intermediate_wavefronts(
             system, system.frames, normalize, only_last=not return_intermediates
-        )
-
-
-def refuse_saving(save_intermediates: bool) -> None:
-    """Raise for poppy's option to write every intermediate plane to a file."""
-    if save_intermediates:
-        raise IncompatibleSetupError(
-            "save_intermediates: this system writes no files on its own; pass "
-            "return_intermediates=True and call .writeto() on the wavefronts"
         )
 
 
@@ -302,7 +267,6 @@ def from_poppy(
     occulter_sampling: float | None = None,
     npix: int | None = None,
     fov_pixels: int | tuple[int, int] | None = None,
-    trainable: Collection[str] = (),
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
 ) -> PoppySystem:
@@ -335,8 +299,6 @@ def from_poppy(
         over blocks. Default poppy's own.
     fov_pixels : int or (ny, nx), optional
         Detector pixels; default those of the system's detector.
-    trainable : collection of str
-        Names of pupil planes that get leaf tensors to train, see ``model.trainable``.
     dtype : torch.dtype
         torch.float64 or torch.float32.
     device : str or torch.device

@@ -297,6 +297,7 @@ class PupilOptic(Plane):
     """
 
     sampled = True
+    pointwise = True
 
     def __init__(
         self,
@@ -307,9 +308,8 @@ class PupilOptic(Plane):
         device: torch.device,
         name: str,
         orientation: Orientation,
-        trainable: bool = False,
     ) -> None:
-        self.name, self.orientation = name, orientation
+        self.name = name
         size = next(iter(phasors.values())).shape[-1]
         first = -((size - npix) // 2)
         full = PupilGrid(npix, diameter, (first, first + size), (first, first + size))
@@ -324,34 +324,15 @@ class PupilOptic(Plane):
             wavelength: turned_phasors[id(phasor)] for wavelength, phasor in phasors.items()
         }
         self._full, self._dtype = full, dtype
-        # With `trainable`, leaf tensors to optimise by their gradients, in the frame of this plane:
-        # `opd` (m) is added, `transmission` is a factor.
-        self.opd: Tensor | None = None
-        self.transmission: Tensor | None = None
-        if trainable:
-            self.opd = torch.zeros(size, size, dtype=dtype, device=device).requires_grad_()
-            self.transmission = torch.ones_like(self.opd).requires_grad_()
-
-    @property
-    def pointwise(self) -> bool:  # type: ignore[override]
-        """See `Plane`: false if the factors are trained."""
-        return self.opd is None
 
     def window(self, values: Values) -> PupilGrid:
         """The window with all samples that transmit light at some wavelength."""
         return self.grid
 
-    def _turned(self, array: Tensor) -> Tensor:
-        return self._full.crop(self.orientation.apply(array), self.grid).to(self._dtype)
-
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        """Multiply by the phasor and the trainable factors."""
+        """Multiply by the phasor."""
         field = wavefront.grid.crop(wavefront.field, self.grid)
         field = field * self._phasors[wavefront.wavelength]
-        if self.opd is not None and self.transmission is not None:
-            opd = self._turned(self.opd)
-            field = field * phase_factor(opd, wavefront.wavelength, self._dtype)
-            field = field * self._turned(self.transmission)
         return replace(wavefront, field=field, grid=self.grid)
 
 

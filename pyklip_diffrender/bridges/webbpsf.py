@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.poppy import (
+    REFUSED,
     PoppySystem,
     check_supported,
     intermediate_wavefronts,
-    refuse_saving,
 )
 from pyklip_diffrender.bridges.sampled_planes import AberrationOptic, SplineRotation
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
@@ -36,7 +36,13 @@ from pyklip_diffrender.optics.planes import (
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.optics.system import OpticalSystem, poppy_psf, save
+from pyklip_diffrender.optics.system import (
+    OpticalSystem,
+    poppy_psf,
+    refuse_keywords,
+    require_one_sampling,
+    save,
+)
 from pyklip_diffrender.wavefront.opd_map import check_opd, opd_to_hdus
 
 __all__ = [
@@ -82,10 +88,7 @@ def oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
     common, fine, pixels = (
         recipe[name] for name in ("oversample", "fft_oversample", "detector_oversample")
     )
-    if None not in (common, fine, pixels):
-        raise IncompatibleSetupError(
-            "give oversample, or detector_oversample with fft_oversample, not all three"
-        )
+    require_one_sampling(common, pixels, fine)
     if common is None and fine is None and pixels is None:
         common = 4
     image, detector = common if fine is None else fine, common if pixels is None else pixels
@@ -270,7 +273,7 @@ class WebbSystem(PoppySystem):
     # Whether the map of the instrument's internal wavefront error is flipped vertically, as stpsf
     # does from 2.2.0 on; None without one.
     si_wfe_flipped: bool | None
-    _sources: ClassVar[tuple[str, ...]] = ("nircam", "trainable")
+    _source: ClassVar[str] = "nircam"
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **PoppySystem._replaced,
         "monochromatic": ("bandpass",),
@@ -328,15 +331,20 @@ class WebbSystem(PoppySystem):
         ----------
         opd, **parameters
             As in a call of the system, for the PSF of a refined wavefront.
-        display, save_intermediates
-            Accepted for compatibility with stpsf; nothing is drawn, and saving is refused.
+        display : bool
+            Draw the PSF, extension OVERSAMP, in a new figure of matplotlib on a logarithmic scale.
+        save_intermediates
+            Refused with a pointer to `return_intermediates`.
 
         Returns
         -------
         HDUList, or (HDUList, list of poppy.Wavefront)
             OVERSAMP, DET_SAMP, OVERDIST and DET_DIST, the last two with `add_distortion`.
         """
-        refuse_saving(save_intermediates)
+        refuse_keywords(
+            {"save_intermediates": REFUSED["save_intermediates"]},
+            {"save_intermediates": save_intermediates},
+        )
         arguments = {
             "source": source,
             "nlambda": nlambda,
@@ -366,6 +374,8 @@ class WebbSystem(PoppySystem):
             for hdu in result:
                 set_keyword(hdu.header, "DRSIFLIP", system.si_wfe_flipped)
         save(result, outfile, overwrite)
+        if display:
+            system.draw_psf(result, parameters)
         if return_intermediates:
             return result, intermediate_wavefronts(
                 system, system.frames, normalize, only_last=False
@@ -390,7 +400,6 @@ def from_webbpsf(
     propagation: str | Mapping[str, str] = "auto",
     occulter_sampling: float | None = None,
     npix: int | None = None,
-    trainable: Collection[str] = (),
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
 ) -> WebbSystem:
@@ -418,7 +427,7 @@ def from_webbpsf(
     flip_si_wfe : bool, optional
         Whether to flip the coronagraph's internal wavefront error vertically; default as in the
         installed stpsf, which flips it from 2.2.0 on. See ``model.si_wfe_flipped``.
-    propagation, occulter_sampling, npix, trainable, dtype, device
+    propagation, occulter_sampling, npix, dtype, device
         See `from_poppy`; the default sampling is `fft_oversample`, the default `npix` that of
         ``nircam.pupil``.
 

@@ -324,6 +324,12 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
             recipe[name] = to_number(recipe[name], unit, name, bound)
     if recipe["pixelscale"] is not None:
         recipe["pixelscale"] = to_pair(recipe["pixelscale"], u.arcsec, "pixelscale", "positive")
+    if callable(recipe["source"]):
+        raise IncompatibleSetupError(
+            f"source: got a {type(recipe['source']).__name__}, expected a temperature in K or "
+            "wavelengths and photons; of a spectrum of synphot, "
+            "source=(spectrum.waveset, spectrum(spectrum.waveset))"
+        )
     if not isinstance(recipe["source"], tuple):
         recipe["source"] = to_number(recipe["source"], u.K, "source", "positive")
     if not isinstance(recipe["si_wfe"], bool | Tensor):

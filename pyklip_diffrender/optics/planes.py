@@ -258,7 +258,7 @@ class Plane(ABC):
     # True for a mask in a focus, False for an optic in a pupil.
     focal: bool = False
     # True if it multiplies each sample of the field in the pupil by a factor that does not depend
-    # on the field, and that no gradient has to reach except by `parameters`.
+    # on the field.
     pointwise: bool = False
     # True if it is known only at the wavelengths that it was made for.
     sampled: bool = False

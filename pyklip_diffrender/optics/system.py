@@ -43,6 +43,8 @@ __all__ = [
     "instrument_psf",
     "one_thread_after_fork",
     "poppy_psf",
+    "refuse_keywords",
+    "require_one_sampling",
     "save",
 ]
 
@@ -539,6 +541,22 @@ _SETUP_KEYWORDS = {
 }
 
 
+def refuse_keywords(reasons: Mapping[str, str], given: Mapping[str, Any]) -> None:
+    """Raise for keywords of poppy's or stpsf's that are set and that a system cannot serve."""
+    for name, reason in reasons.items():
+        # An input wavefront is an array of numbers, without a truth value.
+        if given[name] is not None and given[name] is not False:
+            raise IncompatibleSetupError(f"{name}={given[name]!r}: {reason}")
+
+
+def require_one_sampling(common: int | None, detector: int | None, fft: int | None) -> None:
+    """Raise if the oversampling of detector and image planes is given twice, as stpsf does."""
+    if None not in (common, detector, fft):
+        raise IncompatibleSetupError(
+            "give oversample, or detector_oversample with fft_oversample, not all three"
+        )
+
+
 def save(hdus: fits.HDUList, outfile: str | os.PathLike[str] | None, overwrite: bool) -> None:
     """Write a PSF, unless `outfile` is None; ExistingFileError if it must not be replaced."""
     if outfile is None:
@@ -552,6 +570,16 @@ def save(hdus: fits.HDUList, outfile: str | os.PathLike[str] | None, overwrite: 
 
 
 # `OpticalSystem`: a differentiable coronagraph whose numerical settings can be changed.
+
+_REFUSED = {
+    "save_intermediates": "this system writes no files of its own; debug(opd) returns the field at "
+    "every plane",
+    "return_intermediates": "this system has no poppy.Wavefront objects, as systems of from_poppy "
+    "and from_webbpsf have; debug(opd) returns the field at every plane",
+    "add_distortion": "distortion and charge diffusion are modelled by from_webbpsf only; leave it "
+    "out for OVERSAMP and DET_SAMP alone",
+}
+"""Keywords of stpsf's `calc_psf` that `OpticalSystem.calc_psf` does not serve, and why."""
 
 _BAND = ("monochromatic", "nlambda", "source", "wavelength")
 """Settings that determine the wavelengths."""
@@ -756,27 +784,34 @@ class OpticalSystem(Propagation):
         fft_oversample: int | None = None,
         overwrite: bool = True,
         display: bool = False,
+        save_intermediates: bool = False,
         return_intermediates: bool = False,
         normalize: str = "first",
+        add_distortion: bool = False,
+        crop_psf: bool = True,
         opd: Value | None = None,
         **parameters: Value,
-    ) -> Any:
-        """PSF as an HDUList, with the arguments of `calc_psf` of poppy's and webbpsf's instruments.
+    ) -> fits.HDUList:
+        """PSF as an HDUList, with the arguments of `calc_psf` of poppy's and stpsf's instruments.
 
         Arguments that are not given keep the values that the system was made with.
 
         Parameters
         ----------
+        source : float, Quantity, (wavelengths, photons) or mapping, optional
+            Temperature (K) or spectrum of the star, or "wavelengths" (m) and "weights" of the PSF.
         oversample, detector_oversample, fft_oversample : int, optional
             Samples per pixel, and per lambda/D on the occulter; the first sets both.
         outfile : path, optional
             Write the result there.
         display : bool
-            Accepted for compatibility with poppy; nothing is drawn.
-        return_intermediates : bool
-            Return (HDUList, `debug` of the first wavelength).
+            Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
         normalize : str
             "first", "last", "exit_pupil" or "none", as in poppy.
+        save_intermediates, return_intermediates, add_distortion
+            Refused with a pointer to what does the same.
+        crop_psf
+            Without effect, as in stpsf where there is no distortion.
         opd, **parameters
             As in a call of the system.
 
@@ -784,9 +819,22 @@ class OpticalSystem(Propagation):
         -------
         HDUList
             Extensions OVERSAMP and DET_SAMP.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a keyword of stpsf's that this system does not serve, with the reason, and for a
+            setting that it cannot change.
         """
+        refuse_keywords(_REFUSED, locals())
+        require_one_sampling(oversample, detector_oversample, fft_oversample)
+        bandpass = None
+        if isinstance(source, Mapping):
+            # As stpsf: wavelengths and weights of the PSF, in place of a spectrum and a filter.
+            bandpass = Bandpass(*(tuple(source[name]) for name in ("wavelengths", "weights")))
         changes = {
-            "source": source,
+            "bandpass": bandpass,
+            "source": source if bandpass is None else None,
             "nlambda": nlambda,
             "monochromatic": monochromatic,
             "fov_arcsec": fov_arcsec,
@@ -798,9 +846,28 @@ class OpticalSystem(Propagation):
         sampling = system.recipe.get("occulter_sampling")
         hdus = instrument_psf(system, system.setup, sampling, normalize, opd, **parameters)
         save(hdus, outfile, overwrite)
-        if return_intermediates:
-            return hdus, system.debug(opd, None, **parameters)
+        if display:
+            system.draw_psf(hdus, parameters)
         return hdus
+
+    def draw_psf(self, hdus: fits.HDUList, parameters: Mapping[str, Value]) -> None:
+        """Draw the oversampled image of a PSF in a new figure, for poppy's ``display=True``."""
+        (ax,) = drawing.axes_for(None, 1)
+        self._draw_image(ax, hdus[0].data, self.values(parameters), "PSF")
+
+    def _draw_image(self, ax: Any, light: Array, values: Values, title: str) -> None:
+        """Draw light on the detector's pixels or on its samples."""
+        x, y = (
+            axis.detach().reshape(count, -1).mean(dim=1).cpu().numpy() / ARCSEC
+            for axis, count in zip(self.detector.axes(values), light.shape[::-1], strict=True)
+        )
+        drawing.star_image(
+            ax, light, np.stack(np.meshgrid(x, y), axis=-1), drawing.light_norm(light),
+            bar="fraction of the star's light",
+            title=f"{title}, {1e6 * self.bandpass.mean_wavelength:.2f} um",
+        )  # fmt: skip
+        ax.set_xlabel("x from the optical axis (arcsec)")
+        ax.set_ylabel("y from the optical axis (arcsec)")
 
     def plot(self, ax: Any = None, *, opd: Value | None = None) -> NDArray[Any]:
         """Draw the entrance pupil, the wavefront error, the light in the last pupil and the image.
@@ -830,10 +897,6 @@ class OpticalSystem(Propagation):
             behind = (self._amplitude(last_pupil) / first.max()) ** 2
             light = self(checked).double().cpu().numpy()
             map_ = 1e9 * checked.real.double().cpu().numpy()
-            x, y = (
-                axis.reshape(-1, self.detector.oversample).mean(dim=1).cpu().numpy() / ARCSEC
-                for axis in self.detector.axes(values)
-            )
         width = self.entrance.full.diameter
         map_ = np.where(self.entrance.lit.cpu().numpy(), map_, np.nan)
         drawing.pupil_image(
@@ -844,12 +907,7 @@ class OpticalSystem(Propagation):
             last, behind, width, bar="light, 1 in the first pupil",
             title="light in the last pupil", logarithmic=True,
         )  # fmt: skip
-        drawing.star_image(
-            image, light, np.stack(np.meshgrid(x, y), axis=-1), drawing.light_norm(light),
-            bar="fraction of the star's light", title=f"star on the axis, {1e6 * mean:.2f} um",
-        )  # fmt: skip
-        image.set_xlabel("x from the optical axis (arcsec)")
-        image.set_ylabel("y from the optical axis (arcsec)")
+        self._draw_image(image, light, values, "star on the axis")
         return np.array(axes)
 
     def _amplitude(self, wavefront: Wavefront) -> NDArray[np.float64]:

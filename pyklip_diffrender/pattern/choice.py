@@ -169,8 +169,6 @@ _ROUGH: dict[str, Any] = {
     "min_model_error": 0.05,
     "tolerance": 0.05,
     "adapt_prior": False,
-    "grow_basis": False,
-    "coarse_first": False,
     "companions_if_stalled": False,
 }
 """Changes to the settings of a fit that only tells which pixels a frame shows, which the pattern
@@ -528,7 +526,8 @@ def _rough_fit(
     systematics: Systematics | None = None,
 ) -> Refinement:
     """Fit until the pattern dominates the residual."""
-    settings = replace(settings or settings_for(observation), **_ROUGH)
+    settings = settings or settings_for(observation)
+    settings = replace(settings, cycles=settings.cycles[:1], **_ROUGH)
     return refine(
         model, observation, opd, settings=settings, systematics=systematics, progress=progress
     )

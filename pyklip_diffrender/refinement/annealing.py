@@ -739,9 +739,8 @@ class Annealing:
         """Number of leading modes to fit while the model error is kappa."""
         joint_fit = len(self.problems) > 1
         amplitude = len(self._first.priors.amplitude) > 0
-        coarse = self.settings.coarse_first and not joint_fit and not amplitude
         fine = kappa <= max(_COARSE, self.settings.min_model_error)
-        return self._few_modes if coarse and not fine else len(self.basis)
+        return len(self.basis) if fine or joint_fit or amplitude else self._few_modes
 
     @property
     def _may_add(self) -> bool:

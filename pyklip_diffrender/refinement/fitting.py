@@ -26,7 +26,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement, breakdown_explained
 from pyklip_diffrender.refinement.forward import Problem, starting_values
-from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import OWN_PARAMETERS, GaussNewton, settings_for
 from pyklip_diffrender.scene.admission import require_agreement
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -109,7 +109,7 @@ def fit_in_stages(
         basis = settings.basis or default_basis(pupil=pupil)
         return Annealing(problems, settings, basis, warm, progress, same_frames).run()
     # The number of modes that drift is fixed.
-    grows = settings.wavefront and settings.grow_basis and settings.drift is None
+    grows = settings.wavefront and settings.drift is None
     cycles_to_try = settings.cycles if grows else settings.cycles[:1]
     fit: Refinement | None = None
     for k, cycles in enumerate(cycles_to_try):
@@ -153,10 +153,11 @@ def align_frame(
 ) -> Refinement:
     """Fit place, flux and background of a frame with the wavefront of another fit.
 
-    Lyot stop, blur and internal aberrations are those of the fit. The parameters in `settings.own`
-    are free, and those of at most `companions` point sources beside the star. Pixels that are bad
-    in all its frames of the same detector pixels are left out. Raises `IncompatibleSetupError` for
-    a frame that cannot share a fit with those of `fit`, and `ShapeError` for one of another shape.
+    Lyot stop, blur and internal aberrations are those of the fit. Parameters in
+    `OWN_PARAMETERS` are free, and those of at most `companions` point sources beside the star.
+    Pixels that are bad in all its frames of the same detector pixels are left out. Raises
+    `IncompatibleSetupError` for a frame that cannot share a fit with the frames of `fit`, and
+    `ShapeError` for one of another shape.
     """
     first = fit.frames[0]
     require_agreement([*(frame.observation for frame in fit.frames), observation])
@@ -168,11 +169,10 @@ def align_frame(
     if companions:
         # In frames of a reference star, companions are those of the target, which are not there.
         observation = replace(observation, reference=False)
-    own = tuple(name for name in settings.free if name in settings.own)
+    own = tuple(name for name in settings.free if name in OWN_PARAMETERS)
     alone = replace(
         settings,
         free=own,
-        own=own,
         wavefront=False,
         drift=None,
         dither_drift=None,
@@ -215,15 +215,14 @@ def join_frames(
         replace(fit, settings=settings),
         companions=fit.planets if companions is None else tuple(companions),
     )
-    own = (*settings.own, "pedestal")
     count = len(fit.frames)
     warm = {
         # A single frame has no unknowns of its own.
-        each._replace(frame=0) if count == 1 and each.name in own else each: value
+        each._replace(frame=0) if count == 1 and each.name in OWN_PARAMETERS else each: value
         for each, value in reached.items()
     }
     for k, other in enumerate(others, count):
-        for name in own:
+        for name in OWN_PARAMETERS:
             values = other.frames[0].values.get(name, ())
             warm |= {Unknown(name, i, k): float(value) for i, value in enumerate(values)}
     problems = [
@@ -262,9 +261,8 @@ def refine(
     observation : Observation or sequence of Observation
         The frames of one observation see the same star through the same wavefront and are
         averaged. Several observations (rolls, dithers, a reference star) are fitted together:
-        each has its own star position, flux and background (`GaussNewton.own`), their wavefront
-        is shared, or differs by as much as `GaussNewton.drift` allows, and companions rotate with
-        the position angle.
+        each has its own star position, flux and background, their wavefront is shared, or differs
+        by as much as `GaussNewton.drift` allows, and companions rotate with the position angle.
     opd : path, OPDMap, Quantity, array or "flat"
         The wavefront to start from, entrance-pupil orientation; bare arrays in metres. It is
         resampled to the model's pupil. "flat" stands for a flat wavefront.

@@ -25,6 +25,7 @@ from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, WavefrontPrior, scale_ratios
 
 __all__ = [
+    "OWN_PARAMETERS",
     "GaussNewton",
     "ModePriors",
     "coarse_arguments",
@@ -61,10 +62,13 @@ _DRIFT_RANGE = 4.0
 """Largest factor between the scale of a drift that maximises the evidence and the one stated."""
 
 _SWITCHES = (
-    "wavefront", "grow_basis", "coarse_first", "adapt_prior", "marginal_flux",
-    "companions_if_stalled", "accurate_steps",
+    "wavefront", "adapt_prior", "marginal_flux", "companions_if_stalled", "accurate_steps",
 )  # fmt: skip
 """Fields of `GaussNewton` that are True or False."""
+
+OWN_PARAMETERS = ("star_offset", "detector_shift", "flux", "background", "pedestal")
+"""Parameters of which every frame has a value of its own when several frames are fitted together;
+the frames share the others."""
 
 _RING = (5.0, 16.0)
 _REFERENCE = 1800.0
@@ -105,21 +109,13 @@ class GaussNewton:
     free : tuple of str
         Free parameters besides the wavefront, from the parameter table. The pedestal of a known
         pattern is always free, see `pyklip_diffrender.Systematics`.
-    own : tuple of str
-        Free parameters of which every frame has a value of its own when several frames are fitted
-        together; the others are shared.
     wavefront : bool
         Fit the wavefront; False fits the alignment only.
     cycles : tuple of float
         Highest spatial frequencies of the default basis, in cycles across the pupil. The first
-        one is fitted.
-    grow_basis : bool
-        Fit with the next value of `cycles` while the data are not explained. False where the
-        residual need not be missing modes.
-    coarse_first : bool
-        Fit only modes up to 14 cycles while the model error is above a percent of the star, which
-        is faster. Fits of several frames, or with a free pupil amplitude, have all modes from the
-        beginning.
+        one is fitted, and the next ones in turn while the data are not explained. Give one where
+        the residual need not be missing modes. While the model error is above a percent of the
+        star, fits of one frame with a known pupil amplitude have modes up to 14 cycles only.
     basis : Basis, optional
         Wavefront modes, in place of the default basis: Fourier modes and, for JWST, the motions of
         its segments.
@@ -204,11 +200,8 @@ class GaussNewton:
     """
 
     free: tuple[str, ...] = ("star_offset", "lyot_shift", "lyot_rotation", "flux", "background")
-    own: tuple[str, ...] = ("star_offset", "flux", "background")
     wavefront: bool = True
     cycles: tuple[float, ...] = (24.0, 32.0)
-    grow_basis: bool = True
-    coarse_first: bool = True
     basis: Basis | None = None
     deviations: Mapping[str, float] = field(default_factory=dict)
     prior: WavefrontPrior = field(default_factory=WavefrontPrior)
@@ -241,14 +234,12 @@ class GaussNewton:
                 f"cycles: got {self.cycles!r}, expected a number or several, such as (24, 32)"
             ) from reason
         object.__setattr__(self, "cycles", tuple(cycles.tolist()))
-        for name in ("free", "own"):
-            value = getattr(self, name)
-            if isinstance(value, str):
-                raise IncompatibleSetupError(
-                    f"{name}: got the text {value!r}, expected a tuple of names such as "
-                    f"({value!r},)"
-                )
-            object.__setattr__(self, name, tuple(value))
+        free: Any = self.free
+        if isinstance(free, str):
+            raise IncompatibleSetupError(
+                f"free: got the text {free!r}, expected a tuple of names such as ({free!r},)"
+            )
+        object.__setattr__(self, "free", tuple(free))
         object.__setattr__(self, "companions", tuple(self.companions))
         if not all(isinstance(each, Planet) for each in self.companions):
             raise IncompatibleSetupError(
@@ -426,7 +417,6 @@ class GaussNewton:
                 "flux",
                 "background",
             ),
-            own=("star_offset", "detector_shift", "flux", "background"),
             prior=WavefrontPrior(
                 scales={"segment": 10.0, "texture": 6.0},
                 knee=1.0,
@@ -439,8 +429,6 @@ class GaussNewton:
             adapt_prior=True,
             # Finer modes cost time and leave chi-squared within 3 %.
             cycles=(_cycles_to_edge(wavelength, reach),),
-            grow_basis=False,
-            coarse_first=False,
             drift=_SHORT_WAVE_DRIFT if short else None,
             drift_cycles=12.0,
             deviations={

@@ -37,7 +37,7 @@ from pyklip_diffrender.refinement.forward import (
     State,
     allowance,
 )
-from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors
+from pyklip_diffrender.refinement.settings import OWN_PARAMETERS, GaussNewton, ModePriors
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_evidence
@@ -81,7 +81,7 @@ def first_unknowns(
         )
         for forward in forwards
     )  # fmt: skip
-    own = (*settings.own, "pedestal") if len(frames) > 1 else ()
+    own = OWN_PARAMETERS if len(frames) > 1 else ()
     return Unknowns(frames, own, priors.drift, priors.blocks)
 
 

@@ -188,10 +188,9 @@ _SPECTRA = ("blackbody", "flat", "free")
 """Names of spectra that `combine` knows."""
 
 _SETTINGS = (
-    "free", "own", "wavefront", "cycles", "grow_basis", "coarse_first", "deviations",
-    "drift_cycles", "max_companions", "companion_threshold", "companions_if_stalled",
-    "response_npix", "response_wavelengths", "max_iterations", "tolerance", "min_model_error",
-    "relinearise", "accurate_steps", "robust",
+    "free", "wavefront", "cycles", "deviations", "drift_cycles", "max_companions",
+    "companion_threshold", "companions_if_stalled", "response_npix", "response_wavelengths",
+    "max_iterations", "tolerance", "min_model_error", "relinearise", "accurate_steps", "robust",
 )  # fmt: skip
 """Fields of GaussNewton whose values TOML can hold."""
 

@@ -1,8 +1,9 @@
 """Maps of JWST's wavefront-sensing software (WSS) as archived by MAST.
 
-The steps are those of stpsf's `load_wss_opd`: fill the gaps, interpolate, convert microns, mask,
-and subtract the internal aberration of the sensing camera and the telescope's field dependence,
-both at the sensing field point.
+The steps are the same as in stpsf's `load_wss_opd`: fill the gaps, interpolate, convert microns,
+mask, and subtract the internal aberration of the sensing camera and the telescope's field
+dependence, both at the sensing field point. The last two come from that function, and the others
+also work without stpsf.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from astropy import units as u
 from astropy.time import Time
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import zoom
 
 from pyklip_diffrender.errors import (
     CorruptFileError,
@@ -33,7 +33,7 @@ from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_text, sensing_date
 from pyklip_diffrender.io.units import native_float64, require_shape
-from pyklip_diffrender.wavefront.opd_map import OPDMap, check_opd, opd_to_hdus
+from pyklip_diffrender.wavefront.opd_map import OPDMap, check_opd
 
 __all__ = [
     "EXTENSION",
@@ -56,10 +56,6 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-_TARGET_PHASES = {
-    "NRCA3_FP1": "wss_target_phase_fp1.fits",
-    "NRCA1_FP6": "wss_target_phase_fp6.fits",
-}
 TO_METRES = {"um": 1e-6, "micron": 1e-6, "microns": 1e-6, "m": 1.0, "meter": 1.0, "nm": 1e-9}
 """Units of maps, as the files spell them, in metres."""
 
@@ -105,12 +101,12 @@ def pupil_samples(npix: int, required: bool) -> Array:
     return native_float64(jwst_pupil(npix) > 0)
 
 
-def sensing_terms(aperture: str, opd: Array, npix: int, name: str) -> tuple[Array, str]:
+def sensing_terms(path: Path, aperture: str, npix: int) -> tuple[Array, str]:
     """Sum of the camera's aberration and the telescope's field dependence (m), and its source."""
     if not aperture:
         raise CorruptFileError(
-            f"{name}: no APERNAME in the primary header, so the sensing camera is not known. Pass "
-            "backout_si_wfe=False to keep the sum"
+            f"{path.name}: no APERNAME in the primary header, so the sensing camera is not known. "
+            "Pass backout_si_wfe=False to keep the sum"
         )
     folder = _data_folder()
     if folder is None:
@@ -120,27 +116,17 @@ def sensing_terms(aperture: str, opd: Array, npix: int, name: str) -> tuple[Arra
         )
     stpsf = stpsf_module("to subtract the sensing terms")
     try:
-        instrument = stpsf.instrument(aperture[:3])
-        instrument.pupil = str(next(folder.glob(f"jwst_pupil_RevW_npix{npix}.fits*")))
-        instrument.pupilopd = opd_to_hdus(opd)
-        instrument.set_position_from_aperture_name(aperture)
-        if aperture in _TARGET_PHASES:
-            source = _TARGET_PHASES[aperture]
-            with open_fits(folder / "NIRCam" / "OPD" / source) as hdus:
-                scale = TO_METRES[str(hdus[0].header.get("BUNIT", "m")).strip().lower()]
-                si_wfe = native_float64(hdus[0].data) * scale
-        else:
-            source = "Zernikes of the internal aberrations"
-            si_wfe = native_float64(instrument.get_wfe("si"))
-        ote_wfe = native_float64(instrument.get_wfe("ote_field_dep"))
+        nircam = stpsf.NIRCam()
+        nircam.pupil = str(next(folder.glob(f"jwst_pupil_RevW_npix{npix}.fits*")))
+        nircam.load_wss_opd(os.fspath(path), verbose=False)
     except (RuntimeError, FileNotFoundError, StopIteration, ValueError, KeyError) as error:
         raise CorruptFileError(
             f"the models of stpsf for {aperture!r} could not be read from {folder} ({error}). "
             "STPSF_PATH must hold the complete stpsf data files"
         ) from error
-    if len(si_wfe) != npix:
-        si_wfe = native_float64(zoom(si_wfe, npix / len(si_wfe)))
-    return si_wfe + ote_wfe, source
+    with nircam.pupilopd as hdus:
+        camera, telescope = hdus["SENSING_SI_WFE"], hdus["SENSING_OTE_FD_WFE"]
+        return native_float64(camera.data + telescope.data), camera.header["SOURCE"]
 
 
 # Maps of JWST's wavefront-sensing software (WSS) as archived by MAST.
@@ -268,7 +254,7 @@ def load_wss_opd(
     opd = opd * pupil
     if backout_si_wfe is not False:
         try:
-            terms, source = sensing_terms(aperture, opd, npix, path.name)
+            terms, source = sensing_terms(path, aperture, npix)
         except (CorruptFileError, IncompatibleSetupError) as error:
             if backout_si_wfe:
                 raise
