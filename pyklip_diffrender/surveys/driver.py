@@ -16,7 +16,6 @@ from tqdm import tqdm
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import duration, heartbeat
-from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import Work, in_this_process, with_dask
 from pyklip_diffrender.surveys.jobs import (
@@ -102,7 +101,7 @@ def survey(
     limit = read_config(config).memory_limit
     work: Work = reduce_job
     if limit is not None:
-        work = partial(reduce_job, memory=_OF_WORKER * to_bytes(limit, "memory_limit"))
+        work = partial(reduce_job, memory=_OF_WORKER * limit)
     return run_survey(config, output, work, scheduler, progress=progress)
 
 

@@ -20,7 +20,6 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import fits_files, read_text, sha256
 from pyklip_diffrender.io.headers import file_name
-from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.scene.associations import listed_files
 from pyklip_diffrender.scene.sequence import epochs_of_files
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
@@ -139,7 +138,7 @@ def jobs_of(config: Config) -> list[Job]:
 
 
 def _jobs(
-    sequence: SequenceConfig, digest: Callable[[Path], str], memory_limit: str | None
+    sequence: SequenceConfig, digest: Callable[[Path], str], memory_limit: float | None
 ) -> list[Job]:
     files = _files(sequence.files)
     planets = sequence.injections
@@ -188,7 +187,7 @@ def _job(
     opd: Path,
     epoch: str | None,
     digest: Callable[[Path], str],
-    memory_limit: str | None,
+    memory_limit: float | None,
 ) -> Job:
     options, usual = sequence.options, Options()
     pattern = str(options.systematics)
@@ -209,7 +208,7 @@ def _job(
         chosen["star_flux"] = [options.star_flux, options.star_flux_error]
     # Frames of reference stars for which there is no memory are left out.
     if memory_limit is not None and options.references == "joint" and not options.disk:
-        chosen["memory_limit"] = to_bytes(memory_limit, "memory_limit")
+        chosen["memory_limit"] = memory_limit
     facts = {
         **chosen,
         "version": __version__,
