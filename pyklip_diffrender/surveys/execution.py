@@ -14,7 +14,7 @@ import traceback
 from collections import abc
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -298,7 +298,6 @@ def with_dask(
     with ExitStack() as stack:
         address: Any = scheduler
         if scheduler is None:
-            stack.enter_context(_without_messages("distributed"))
             stack.enter_context(config.set({
                 # A worker that is not back after this time is given up, by default after 15 s.
                 "distributed.deploy.lost-worker-timeout": "7 days",
@@ -355,18 +354,6 @@ def _why_not_spawned() -> str:
         "A script that calls survey needs `if __name__ == '__main__':`; workers = 0 does without "
         "processes"
     )
-
-
-@contextmanager
-def _without_messages(name: str) -> Iterator[None]:
-    """Silence a library; the survey says itself what became of the job of a worker that died."""
-    logger = logging.getLogger(name)
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
 
 
 def _record_of(future: Any, job: Job, jobs: Path) -> Record:

@@ -45,10 +45,6 @@ __all__ = [
 ]
 
 
-_ALWAYS = ("size", "threshold", "systematics", "settings")
-"""Options in the key of every job. Others are in it where they are not as usual, so that jobs of
-configurations without them keep their names."""
-
 _DIGITS = 12
 """Digits of the key at the end of the name of a folder."""
 
@@ -189,7 +185,7 @@ def _job(
     digest: Callable[[Path], str],
     memory_limit: float | None,
 ) -> Job:
-    options, usual = sequence.options, Options()
+    options = sequence.options
     pattern = str(options.systematics)
     known = [] if pattern in ("auto", "references", "off") else _files((Path(pattern),))
     maps = [] if str(opd) == FLAT else [opd]
@@ -197,20 +193,8 @@ def _job(
     members = [each.path for each in listed_files(files) if not each.reason]
     frames = dict.fromkeys((*files, *members))
     inputs = {str(path): digest(path) for path in (*frames, *maps, *known)}
-    chosen = {
-        name: value
-        for name, value in vars(options).items()
-        if name in _ALWAYS or value != getattr(usual, name)
-    }
-    # The error has no effect without the flux.
-    chosen.pop("star_flux_error", None)
-    if options.star_flux is not None:
-        chosen["star_flux"] = [options.star_flux, options.star_flux_error]
-    # Frames of reference stars for which there is no memory are left out.
-    if memory_limit is not None and options.references == "joint" and not options.disk:
-        chosen["memory_limit"] = memory_limit
-    facts = {
-        **chosen,
+    facts: dict[str, Any] = {
+        **vars(options),
         "version": __version__,
         "frames": sorted(inputs[str(path)] for path in frames),
         "opd": inputs.get(str(opd), FLAT),
@@ -219,8 +203,11 @@ def _job(
         "systematics": (
             inputs.get(pattern) or sorted(inputs[str(path)] for path in known) or pattern
         ),
-        **({} if epoch is None else {"epoch": epoch}),
+        "epoch": epoch,
     }
+    # Frames of reference stars for which there is no memory are left out.
+    if options.references == "joint" and not options.disk:
+        facts["memory_limit"] = memory_limit
     return Job(
         hash_of(facts),
         sequence.name if epoch is None else f"{sequence.name} {epoch[:10]}",
