@@ -42,12 +42,6 @@ class Options(SharedOptions):
 
     settings: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def keywords(self) -> dict[str, Any]:
-        """Arguments of `ReduceOptions`, but for `settings`."""
-        names = (each.name for each in fields(self))
-        return {name: getattr(self, name) for name in names if name != "settings"}
-
 
 @dataclass(frozen=True)
 class Injections:

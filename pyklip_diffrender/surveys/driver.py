@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import time
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -26,7 +25,7 @@ from pyklip_diffrender.surveys.jobs import (
     prepare,
     read_record,
     rename_to_jobs,
-    staging,
+    staged,
 )
 from pyklip_diffrender.surveys.stars import StarSearch, search_stars
 from pyklip_diffrender.surveys.survey_page import row, table_of, write_tables
@@ -234,18 +233,14 @@ class _Board:
 
         text = page(self.jobs, self.stars)
         # Written beside the old ones and then moved: whoever reads them meanwhile gets whole files.
-        folder = None
         try:
-            folder = staging(self.output / "jobs", "tables")
-            write_tables(self.rows, folder)
-            (folder / "survey.html").write_text(text, encoding="utf-8")
-            for path in folder.iterdir():
-                os.replace(path, self.output / path.name)
+            with staged(self.output / "jobs", "tables") as folder:
+                write_tables(self.rows, folder)
+                (folder / "survey.html").write_text(text, encoding="utf-8")
+                for path in folder.iterdir():
+                    os.replace(path, self.output / path.name)
         except OSError as error:
             raise IncompatibleSetupError(
                 f"output: the tables cannot be written to {self.output} ({error.strerror}). Make "
                 "room, and start the survey again: finished jobs are kept"
             ) from error
-        finally:
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)

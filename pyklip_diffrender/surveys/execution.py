@@ -6,7 +6,6 @@ import hashlib
 import logging
 import math
 import os
-import shutil
 import socket
 import sys
 import time
@@ -43,7 +42,7 @@ from pyklip_diffrender.surveys.jobs import (
     finished,
     publish,
     read_record,
-    staging,
+    staged,
     write_record,
 )
 
@@ -88,10 +87,9 @@ def _sequence(job: Job) -> Sequence:
 
 def _options(job: Job, frames: Observation, **changes: Any) -> ReduceOptions:
     """Options of a job's reduction; settings that it does not name are those of the preset."""
-    keywords = {**job.options.keywords, **changes}
-    if job.options.settings:
-        keywords["settings"] = nircam_settings(frames, **job.options.settings)
-    return ReduceOptions(**keywords)
+    own = job.options.settings
+    changes["settings"] = nircam_settings(frames, **own) if own else None
+    return ReduceOptions(**{**vars(job.options), **changes})
 
 
 def _with_disk(
@@ -151,21 +149,18 @@ def run_job(job: Job, jobs: Path, work: Work, base: Record | None = None) -> Rec
         return known
     began = time.perf_counter()
     _reset_peak()
-    folder = None
     try:
         if base is not None and base["status"] != "finished":
             raise RefinementError("the reduction without a planet failed, see there")
         _require_same_world(job, jobs)
         if base is not None and job.base_folder is not None:
             _appears(jobs / job.base_folder)
-        folder = staging(jobs, job.key)
-        result = work(job, folder)
-        record = {**_circumstances(began), "status": "finished", "result": result}
-        whole = write_record(folder, job, record)
-        publish(folder, final)
+        with staged(jobs, job.key) as folder:
+            result = work(job, folder)
+            record = {**_circumstances(began), "status": "finished", "result": result}
+            whole = write_record(folder, job, record)
+            publish(folder, final)
     except Exception as error:
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
         return failure(job, jobs, error, **_circumstances(began))
     return whole
 
@@ -179,14 +174,9 @@ def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) ->
         "traceback": encodable("".join(traceback.format_exception(error))),
         "result": {},
     }
-    folder = None
-    try:
-        folder = staging(jobs, job.key)
+    with suppress(OSError), staged(jobs, job.key) as folder:
         record = write_record(folder, job, record)
         publish(folder, jobs / job.folder)
-    except OSError:
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
     return record
 
 

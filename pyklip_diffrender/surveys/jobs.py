@@ -9,8 +9,8 @@ import os
 import secrets
 import shutil
 import socket
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -40,6 +40,7 @@ __all__ = [
     "publish",
     "read_record",
     "rename_to_jobs",
+    "staged",
     "staging",
     "write_record",
 ]
@@ -261,9 +262,8 @@ def prepare(output: Path) -> Path:
     jobs = output / "jobs"
     try:
         jobs.mkdir(parents=True, exist_ok=True)
-        probe = staging(jobs, "probe")
-        (probe / RECORD).write_bytes(bytes(4096))
-        shutil.rmtree(probe)
+        with staged(jobs, "probe") as probe:
+            (probe / RECORD).write_bytes(bytes(4096))
     except OSError as error:
         raise IncompatibleSetupError(
             f"output: got {output}, expected a folder that can be written to ({error.strerror}). "
@@ -277,6 +277,16 @@ def staging(jobs: Path, key: str) -> Path:
     path = jobs / f".{key}-{os.getpid()}-{secrets.token_hex(4)}@{_place()}"
     path.mkdir()
     return path
+
+
+@contextmanager
+def staged(jobs: Path, key: str) -> Iterator[Path]:
+    """Folder of `staging` that is removed in the end, unless `publish` has renamed it."""
+    folder = staging(jobs, key)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @cache
