@@ -13,7 +13,7 @@ from typing import Any
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.units import full_circle, to_bytes
-from pyklip_diffrender.options import OPTIONS, SharedOptions
+from pyklip_diffrender.options import OPTIONS, Option, SharedOptions
 from pyklip_diffrender.scene.associations import matches
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
@@ -21,6 +21,10 @@ __all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
 
 _PIXEL = 0.063
 """arcsec; for the largest separation of an injected planet."""
+
+_WORKERS = Option(
+    "workers", None, "Processes.", int, expected="a number of processes, 0 or more"
+)  # fmt: skip
 
 _SPECTRA = ("blackbody", "flat", "free")
 """Names of spectra that `combine` knows."""
@@ -198,8 +202,7 @@ class _Reader:
     def config(self, content: Mapping[str, Any]) -> Config:
         """The whole configuration."""
         top = self.values(content, "", {
-            # As many others as there may be planets.
-            "workers": ("a number of processes, 0 or more", OPTIONS["injections"].checked),
+            "workers": (_WORKERS.expected, _WORKERS.checked),
             "memory_limit": ('text such as "4 GB"', lambda value: to_bytes(_text(value), "")),
             "options": _TABLE,
             "injections": _TABLE,
