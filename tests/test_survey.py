@@ -363,7 +363,7 @@ def test_workers_start_with_a_planet_after_the_job_without(tmp_path, broken):
         return stub(job, folder)
 
     with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=4, processes=False, dashboard_address=None
+        n_workers=1, threads_per_worker=4, processes=False, dashboard_address="127.0.0.1:0"
     ) as cluster:
         table = run_survey(config, output, work, cluster.scheduler_address)
     second = ["failed" if broken else "finished"] * 3
