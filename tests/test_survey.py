@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+import time
 from dataclasses import replace
 from datetime import date
 from functools import partial
@@ -342,6 +343,34 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path):
     assert "at the second star" in (output / "survey.html").read_text()
     assert list(run_survey(config, output, stub)["status"]) == ["finished"] * 6
     assert (folder / "report.html").exists()
+    assert hidden(output) == []
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_workers_start_with_a_planet_after_the_job_without(tmp_path, broken):
+    distributed = pytest.importorskip("distributed")
+    config, output = inputs(tmp_path / "data", 2), tmp_path / "out"
+    config["injections"] = {**PLANET, "angles": [0, 90.0]}
+
+    def work(job, folder):
+        if job.injection is None:
+            # Time for the jobs with planets to be wrong.
+            time.sleep(0.1)
+            if broken and job.name.startswith("star1"):
+                raise ZeroDivisionError("at the second star")
+        else:
+            assert folders.finished(folder.parent / job.base_folder)
+        return stub(job, folder)
+
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=4, processes=False, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        table = run_survey(config, output, work, cluster.scheduler_address)
+    second = ["failed" if broken else "finished"] * 3
+    assert list(table["status"]) == ["finished"] * 3 + second
+    if broken:
+        assert "at the second star" in table["message"][3]
+        assert all("without a planet failed" in each for each in table["message"][4:])
     assert hidden(output) == []
 
 

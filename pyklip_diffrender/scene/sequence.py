@@ -232,8 +232,8 @@ class Sequence:
         ----------
         files : path or sequence of path
             Stage-2 files (calints), spaceKLIP's aligned files, folders of either, patterns such as
-            ``frames/*_calints.fits``, or association files of the archive (``*_asn.json``), of which
-            members of the types science and psf are used, by paths relative to the file. With
+            ``frames/*_calints.fits``, or association files of the archive (``*_asn.json``), of
+            which members of the types science and psf are used, by paths relative to the file. With
             both, science is the target and psf are references, whatever the headers say. In a
             folder, association files are not read.
         target : str, optional

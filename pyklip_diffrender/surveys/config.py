@@ -4,195 +4,34 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
-from functools import partial
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import read_text
-from pyklip_diffrender.io.units import full_circle
-from pyklip_diffrender.options import OPTIONS, SharedOptions
+from pyklip_diffrender.io.units import full_circle, to_bytes
+from pyklip_diffrender.options import OPTIONS, Option, SharedOptions
 from pyklip_diffrender.scene.associations import matches
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
-__all__ = [
-    "CheckedTable",
-    "Config",
-    "Injections",
-    "Options",
-    "SequenceConfig",
-    "as_count",
-    "as_list",
-    "as_number",
-    "as_positive",
-    "as_table",
-    "as_text",
-    "list_of",
-    "only",
-    "read_config",
-    "short",
-]
-
-
-# A table of a configuration whose values are checked one by one, with all mistakes collected.
-
-Convert = Callable[[Any], Any]
-"""Takes a value, and raises ValueError if it is not as expected."""
-
-
-class CheckedTable:
-    """A table of the file, whose keys are taken one by one.
-
-    Parameters
-    ----------
-    content : mapping
-        Anything else is a mistake.
-    place : str
-        Name of the table in messages; "" for the whole file.
-    folder : Path
-        Of the file, to which paths are relative.
-    problems : list of str
-        All mistakes are added to it.
-    """
-
-    def __init__(self, content: Any, place: str, folder: Path, problems: list[str]) -> None:
-        self.place, self.folder, self.problems = place, folder, problems
-        if not isinstance(content, Mapping):
-            self.complain("", content, "a table with keys")
-            content = {}
-        self.content = dict(content)
-        self.known: list[str] = []
-
-    def complain(self, key: str, value: Any, expected: str) -> None:
-        """Add a mistake: the value of a key, or of the table for ""."""
-        where = ": ".join(filter(None, [self.place, key]))
-        self.problems.append(f"{where}: got {short(value)}, expected {expected}")
-
-    def take(self, key: str, default: Any, expected: str, convert: Convert) -> Any:
-        """Value of a key; `convert` raises ValueError for one that is not as expected."""
-        self.known.append(key)
-        if key not in self.content:
-            return default
-        value = self.content.pop(key)
-        try:
-            return convert(value)
-        except (ValueError, OverflowError):
-            self.complain(key, value, expected)
-            return default
-
-    def table(self, key: str) -> CheckedTable:
-        """The table of a key; empty if there is none."""
-        self.known.append(key)
-        where = ": ".join(filter(None, [self.place, key]))
-        return CheckedTable(self.content.pop(key, {}), where, self.folder, self.problems)
-
-    def existing(self, value: Any) -> Path:
-        """A path that exists, relative to the configuration's folder."""
-        path = self.folder / as_text(value)
-        try:
-            exists = path.exists()
-        except OSError as error:  # Such as a name that is too long.
-            raise ValueError(str(path)) from error
-        if not exists:
-            raise ValueError(str(path))
-        return path.absolute()
-
-    def matching(self, value: Any) -> list[Path]:
-        """Paths of a pattern, or the one that exists, relative to the configuration's folder."""
-        found = matches(self.folder / as_text(value))
-        return [self.existing(str(path.absolute())) for path in found]
-
-    def finish(self) -> None:
-        """Complain about keys that nobody took."""
-        for key in self.content:
-            where = f"{self.place}: " if self.place else ""
-            self.problems.append(
-                f"{where}got the key {short(key)}, expected one of {', '.join(self.known)}. "
-                "Check its name and in which table it is"
-            )
-
-
-def short(value: Any) -> str:
-    """A value in at most 80 characters."""
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def as_text(value: Any) -> str:
-    """Printable text, without the spaces around it."""
-    if not isinstance(value, str) or not value.strip() or not value.isprintable():
-        raise ValueError
-    return value.strip()
-
-
-def as_number(value: Any) -> float:
-    """A finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError
-    return float(value)
-
-
-def as_count(value: Any) -> int:
-    """A whole number, 0 or more."""
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 1_000_000:
-        raise ValueError
-    return value
-
-
-def as_table(value: Any) -> dict[str, Any]:
-    """A mapping."""
-    if not isinstance(value, Mapping):
-        raise ValueError
-    return dict(value)
-
-
-def as_list(value: Any) -> list[Any]:
-    """A list, which may be empty."""
-    if not isinstance(value, list):
-        raise ValueError
-    return value
-
-
-def list_of(convert: Convert) -> Callable[[Any], tuple[Any, ...]]:
-    """Accept lists whose entries all are as expected."""
-    return lambda value: tuple(map(convert, as_list(value)))
-
-
-def only(convert: Convert, is_allowed: Callable[[Any], object]) -> Convert:
-    """Accept some of the values that a converter accepts."""
-
-    def check(value: Any) -> Any:
-        converted = convert(value)
-        if not is_allowed(converted):
-            raise ValueError
-        return converted
-
-    return check
-
-
-as_positive = only(as_number, lambda number: number > 0)
-
-
-# The configuration of a survey: a TOML file, checked as a whole before any work.
+__all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
 
 _PIXEL = 0.063
 """arcsec; for the largest separation of an injected planet."""
 
-_MEMORY = re.compile(r"\d+(\.\d+)? ?([kMGT]i?)?B")
+_WORKERS = Option(
+    "workers", None, "Processes.", int, expected="a number of processes, 0 or more"
+)  # fmt: skip
 
 _SPECTRA = ("blackbody", "flat", "free")
 """Names of spectra that `combine` knows."""
 
-_SETTINGS = (
-    "free", "wavefront", "cycles", "deviations", "drift_cycles", "max_companions",
-    "companion_threshold", "companions_if_stalled", "response_npix", "response_wavelengths",
-    "max_iterations", "tolerance", "min_model_error", "relinearise", "accurate_steps", "robust",
-)  # fmt: skip
-"""Fields of GaussNewton whose values TOML can hold."""
+_NOT_IN_TOML = ("basis", "prior", "drift", "dither_drift", "companions", "memory")
+"""Fields of GaussNewton that are objects of Python, and the memory, for which surveys have
+`memory_limit`."""
 
 
 @dataclass(frozen=True)
@@ -206,12 +45,6 @@ class Options(SharedOptions):
     """
 
     settings: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def keywords(self) -> dict[str, Any]:
-        """Arguments of `ReduceOptions`, but for `settings`."""
-        names = (each.name for each in fields(self))
-        return {name: getattr(self, name) for name in names if name != "settings"}
 
 
 @dataclass(frozen=True)
@@ -272,8 +105,8 @@ class Config:
     sequences : tuple of SequenceConfig
     workers : int or None
         Processes; None for one per core, 0 for this process alone.
-    memory_limit : str or None
-        Of each worker, such as "4 GB"; None for an equal share of the machine's.
+    memory_limit : float or None
+        Of each worker, bytes; None for an equal share of the machine's.
     spectra : tuple of str
         Spectra of planets for the search over the filters of a star, see `combine`; empty for its
         defaults.
@@ -281,7 +114,7 @@ class Config:
 
     sequences: tuple[SequenceConfig, ...]
     workers: int | None = None
-    memory_limit: str | None = None
+    memory_limit: float | None = None
     spectra: tuple[str, ...] = ()
 
 
@@ -318,122 +151,256 @@ def read_config(source: str | os.PathLike[str] | Mapping[str, Any]) -> Config:
             raise CorruptFileError(
                 f"{path}: not a TOML file ({error}). Correct it; text needs quotes"
             ) from error
-    problems: list[str] = []
-    config = _config(CheckedTable(content, "", folder, problems))
-    if problems:
-        raise IncompatibleSetupError("\n  ".join([f"{name}: nothing was started:", *problems]))
+    reader = _Reader(folder)
+    config = reader.config(content)
+    if reader.problems:
+        raise IncompatibleSetupError(
+            "\n  ".join([f"{name}: nothing was started:", *reader.problems])
+        )
     return config
 
 
-def _config(top: CheckedTable) -> Config:
-    workers = top.take("workers", None, "a number of processes, 0 or more", as_count)
-    memory = top.take("memory_limit", None, 'text such as "4 GB"', only(as_text, _MEMORY.fullmatch))
-    shared = top.table("options")
-    options = _options(shared, Options())
-    shared.finish()
-    injections = _injections(top.table("injections"), Injections())
-    together = top.table("combined")
-    spectra = together.take(
-        "spectra", (), f"a list of {', '.join(map(repr, _SPECTRA))} or existing tables",
-        only(list_of(lambda each: each if each in _SPECTRA else str(top.existing(each))), bool),
-    )  # fmt: skip
-    together.finish()
-    listed = top.take("sequence", [], "one or more tables [[sequence]]", as_list)
-    sequences: list[SequenceConfig] = []
-    for k, each in enumerate(listed, 1):
-        table = CheckedTable(each, f"sequence {k}", top.folder, top.problems)
-        sequence = _sequence(table, options, injections)
-        if sequence is None:
-            continue
-        if sequence.name in [other.name for other in sequences]:
-            table.complain("name", sequence.name, "a name that no other sequence has; add `name`")
-        sequences.append(sequence)
-    top.finish()
-    if not listed and not top.problems:
-        top.complain("sequence", "none", "one or more tables [[sequence]] with files and opd")
-    return Config(tuple(sequences), workers, memory, spectra)
+Check = Callable[[Any], Any]
+"""Returns a value as it is stored, and raises ValueError for one that is not as expected."""
+
+Keys = Mapping[str, tuple[str, Check]]
+"""Keys of a table, with what is expected and its check."""
 
 
-def _sequence(
-    table: CheckedTable, options: Options, injections: Injections
-) -> SequenceConfig | None:
-    expected = "FITS files, folders of them, patterns such as frames/*_calints.fits or association "
-    expected += "files that exist; paths are relative to the folder of the configuration"
+class _Reader:
+    """Checks the tables of a configuration, and collects all mistakes."""
 
-    def paths(value: Any) -> tuple[Path, ...]:
-        several = value if isinstance(value, list) else [value]
-        found = tuple(path for each in several for path in table.matching(each))
-        if not found:
-            raise ValueError
-        return found
+    def __init__(self, folder: Path) -> None:
+        # To which paths are relative.
+        self.folder = folder
+        self.problems: list[str] = []
 
-    missing: list[Any] = [key for key in ("files", "opd") if key not in table.content]
-    for key in missing:
-        table.complain(key, "nothing", f'a path, such as {key} = "{key}.fits"')
-    files = table.take("files", None, expected, paths)
-    opd = table.take(
-        "opd", None, "a wavefront map or a folder of maps that exists, or 'flat'",
-        lambda value: Path(FLAT) if value == FLAT else table.existing(value),
-    )  # fmt: skip
-    target = table.take("target", None, "text, the name of the star", as_text)
-    filter_ = table.take("filter", None, 'text such as "F444W"', as_text)
-    first = files[0] if files else Path("sequence")
-    is_named = "name" in table.content
-    label = " ".join(filter(None, [target or first.name.split(".")[0], filter_]))
-    name = table.take("name", label, "printable text", as_text)
-    own = _options(table, options)
-    planets = _injections(table.table("injections"), injections)
-    edge = own.side * _PIXEL / 2
-    for each in planets.separations:
-        if each >= edge:
-            table.complain("separations", each, f"less than {edge:.2g} arcsec, half of the field")
-    table.finish()
-    if files is None or opd is None:
-        return None
-    return SequenceConfig(name, files, opd, target, filter_, own, planets, is_named)
+    def complain(self, place: str, value: Any, expected: str) -> None:
+        """Add a mistake."""
+        self.problems.append(f"{place}: got {_short(value)}, expected {expected}")
 
+    def values(self, content: Any, place: str, keys: Keys) -> dict[str, Any]:
+        """Values of the table at a place, which is "" for the whole file; mistakes are left out."""
+        if not isinstance(content, Mapping):
+            self.complain(place, content, "a table with keys")
+            return {}
+        values = {}
+        for key, value in content.items():
+            if key not in keys:
+                self.problems.append(
+                    f"{place and f'{place}: '}got the key {_short(key)}, expected one of "
+                    f"{', '.join(keys)}. Check its name and in which table it is"
+                )
+                continue
+            expected, check = keys[key]
+            try:
+                values[key] = check(value)
+            except (ValueError, OverflowError):
+                self.complain(f"{place}: {key}" if place else key, value, expected)
+        return values
 
-def _options(table: CheckedTable, default: Options) -> Options:
-    def pattern(choices: tuple[str, ...], value: Any) -> str:
-        if value in choices:
+    def config(self, content: Mapping[str, Any]) -> Config:
+        """The whole configuration."""
+        top = self.values(content, "", {
+            "workers": (_WORKERS.expected, _WORKERS.checked),
+            "memory_limit": ('text such as "4 GB"', lambda value: to_bytes(_text(value), "")),
+            "options": _TABLE,
+            "injections": _TABLE,
+            "combined": _TABLE,
+            "sequence": ("one or more tables [[sequence]]", _list),
+        })  # fmt: skip
+        given = self.values(top.pop("options", {}), "options", self.option_keys)
+        options = self.options(given, Options(), "options")
+        planets = self.injections(top.pop("injections", {}), Injections(), "injections")
+        names = ", ".join(map(repr, _SPECTRA))
+        combined = self.values(top.pop("combined", {}), "combined", {
+            "spectra": (f"a list of {names} or existing tables", self.spectra),
+        })  # fmt: skip
+        if "sequence" not in content:
+            self.complain("sequence", "none", "one or more tables [[sequence]] with files and opd")
+        sequences: list[SequenceConfig] = []
+        for k, each in enumerate(top.pop("sequence", ()), 1):
+            sequence = self.sequence(each, f"sequence {k}", options, planets)
+            if sequence is None:
+                continue
+            if sequence.name in [other.name for other in sequences]:
+                expected = "a name that no other sequence has; add `name`"
+                self.complain(f"sequence {k}: name", sequence.name, expected)
+            sequences.append(sequence)
+        return Config(tuple(sequences), **top, **combined)
+
+    def sequence(
+        self, content: Any, place: str, options: Options, planets: Injections
+    ) -> SequenceConfig | None:
+        """A sequence, whose own options and planets come before those of all; None without one."""
+        given = self.values(content, place, {
+            "files": (
+                "FITS files, folders of them, patterns such as frames/*_calints.fits or "
+                "association files that exist; paths are relative to the folder of the "
+                "configuration",
+                self.matching,
+            ),
+            "opd": (
+                "a wavefront map or a folder of maps that exists, or 'flat'",
+                lambda value: Path(FLAT) if value == FLAT else self.existing(value),
+            ),
+            "target": ("text, the name of the star", _text),
+            "filter": ('text such as "F444W"', _text),
+            "name": ("printable text", _text),
+            "injections": _TABLE,
+            **self.option_keys,
+        })  # fmt: skip
+        own = self.options(given, options, place)
+        planets = self.injections(given.pop("injections", {}), planets, f"{place}: injections")
+        edge = own.side * _PIXEL / 2
+        for each in planets.separations:
+            if each >= edge:
+                expected = f"less than {edge:.2g} arcsec, half of the field"
+                self.complain(f"{place}: separations", each, expected)
+        for key in ("files", "opd"):
+            if key not in (content if isinstance(content, Mapping) else given):
+                self.complain(f"{place}: {key}", "nothing", f'a path, such as {key} = "{key}.fits"')
+        if not {"files", "opd"} <= set(given):
+            return None
+        first = given["files"][0].name.split(".")[0]
+        label = " ".join(filter(None, [given.get("target") or first, given.get("filter")]))
+        is_named = "name" in given
+        given = {"name": label, **given}
+        return SequenceConfig(**given, options=own, injections=planets, is_named=is_named)
+
+    @property
+    def option_keys(self) -> Keys:
+        """Keys of the options of a reduction, by what these declare."""
+        checks = {each.name: OPTIONS[each.name].checked for each in fields(SharedOptions)}
+        checks["systematics"] = self.pattern
+        return {
+            **{name: (OPTIONS[name].expected, check) for name, check in checks.items()},
+            "settings": ("a table with arguments of GaussNewton", _table),
+        }
+
+    def options(self, given: dict[str, Any], default: Options, place: str) -> Options:
+        """Options of a table, whose values they are taken from."""
+        own = {each.name: given.pop(each.name) for each in fields(Options) if each.name in given}
+        if "settings" in own:
+            # Those of a sequence come on top of the survey's.
+            settings = {**default.settings, **own.pop("settings")}
+            wrong = _wrong_settings(settings)
+            self.problems += [f"{place}: settings: {each}" for each in wrong]
+            own |= {} if wrong else {"settings": settings}
+        options = replace(default, **own)
+        if options.wide and options.disk:
+            self.complain(place, "wide = true and disk = true", "one of them")
+            options = replace(options, disk=False)
+        return options
+
+    def injections(self, content: Any, default: Injections, place: str) -> Injections:
+        """Planets of a table."""
+        numbers = "a list of positive numbers, such as [1e-5]"
+        own = self.values(content, place, {
+            "contrasts": (
+                f"{numbers}, fluxes over the star's and no magnitudes",
+                lambda value: _numbers(value, 0, 1),
+            ),
+            "separations": (numbers, lambda value: _numbers(value, 0, math.inf)),
+            "angles": (
+                "a list of degrees east of north",
+                lambda value: tuple(map(full_circle, _numbers(_list(value), -math.inf, math.inf))),
+            ),
+        })  # fmt: skip
+        planets = replace(default, **own)
+        if content and bool(planets.contrasts) != bool(planets.separations):
+            self.complain(place, "one of contrasts and separations", "both, or neither")
+        return planets
+
+    def pattern(self, value: Any) -> str:
+        """A flat-field pattern: one of the words for it, or a path."""
+        if value in OPTIONS["systematics"].choices:
             return str(value)
         # Late, see `_wrong_settings`. Files without patterns are found before any job begins.
         from pyklip_diffrender.pattern import as_request
 
+        path = self.existing(value)
         try:
-            as_request(table.existing(value))
+            as_request(path)
         except DiffrenderError as error:
             raise ValueError(str(error)) from error
-        return str(table.existing(value))
+        return str(path)
 
-    values: dict[str, Any] = {}
-    for name in default.keywords:
-        each = OPTIONS[name]
-        convert = partial(pattern, each.choices) if each.path else each.checked
-        values[name] = table.take(name, getattr(default, name), each.expected, convert)
-    if values["wide"] and values["disk"]:
-        table.complain("", "wide = true and disk = true", "one of them")
-        values["disk"] = False
-    own = table.take("settings", {}, "a table with arguments of GaussNewton", as_table)
-    # Those of a sequence come on top of the survey's.
-    settings = {**default.settings, **own}
-    wrong = _wrong_settings(settings) if own else []
-    where = f"{table.place}: settings"
-    table.problems += [f"{where}: {each}" for each in wrong]
-    return Options(**values, settings=default.settings if wrong else settings)
+    def spectra(self, value: Any) -> tuple[str, ...]:
+        """Spectra of planets: their names, or paths of tables."""
+        return tuple(
+            each if each in _SPECTRA else str(self.existing(each)) for each in _list(value)
+        )
+
+    def existing(self, value: Any) -> Path:
+        """A path that exists."""
+        path = self.folder / _text(value)
+        try:
+            exists = path.exists()
+        except OSError as error:  # Such as a name that is too long.
+            raise ValueError(str(path)) from error
+        if not exists:
+            raise ValueError(str(path))
+        return path.absolute()
+
+    def matching(self, value: Any) -> tuple[Path, ...]:
+        """Paths of a pattern, or those that exist, or of a list of them."""
+        several = value if isinstance(value, list) else [value]
+        found = [path for each in several for path in matches(self.folder / _text(each))]
+        return tuple(self.existing(str(path.absolute())) for path in _list(found))
+
+
+def _short(value: Any) -> str:
+    """A value in at most 80 characters."""
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _text(value: Any) -> str:
+    """Printable text, without the spaces around it."""
+    if not isinstance(value, str) or not value.strip() or not value.isprintable():
+        raise ValueError
+    return value.strip()
+
+
+def _numbers(value: Any, least: float, most: float) -> tuple[float, ...]:
+    """Numbers of a list, which may be empty, all between two others."""
+    if not isinstance(value, list) or not all(
+        isinstance(each, int | float) and not isinstance(each, bool) and least < each < most
+        for each in value
+    ):
+        raise ValueError
+    return tuple(map(float, value))
+
+
+def _list(value: Any) -> list[Any]:
+    """A list that is not empty."""
+    if not isinstance(value, list) or not value:
+        raise ValueError
+    return value
+
+
+def _table(value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ValueError
+    return value
+
+
+_TABLE: tuple[str, Check] = ("a table with keys", lambda value: value)
+"""A table whose own keys are checked later."""
 
 
 def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
     """Mistakes in arguments of `GaussNewton.nircam`."""
-    unknown = sorted(set(settings) - set(_SETTINGS))
-    if unknown:
-        known = ", ".join(_SETTINGS)
-        return [f"got the key {short(key)}, expected one of {known}" for key in unknown]
-    if not _is_plain(settings):
-        return ["got a date or nan, expected numbers, text, lists and tables"]
     # Late, as everything that waits for PyTorch: workers import this module to unpickle a job.
     from pyklip_diffrender.refinement import GaussNewton
 
+    known = [each.name for each in fields(GaussNewton) if each.name not in _NOT_IN_TOML]
+    unknown = sorted(set(settings) - set(known))
+    if unknown:
+        return [f"got the key {_short(key)}, expected one of {', '.join(known)}" for key in unknown]
+    if not _is_plain(settings):
+        return ["got a date or nan, expected numbers, text, lists and tables"]
     try:
         GaussNewton.nircam(**settings)
     except DiffrenderError as error:
@@ -441,23 +408,6 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
         return [f"got a value of the wrong type ({error}), expected those of GaussNewton"]
     return []
-
-
-def _injections(table: CheckedTable, default: Injections) -> Injections:
-    own = bool(table.content)
-    numbers = "a list of positive numbers, such as [1e-5]"
-    contrasts = table.take(
-        "contrasts", default.contrasts, f"{numbers}, fluxes over the star's and no magnitudes",
-        list_of(only(as_positive, lambda contrast: contrast < 1)),
-    )  # fmt: skip
-    separations = table.take("separations", default.separations, numbers, list_of(as_positive))
-    angles = table.take(
-        "angles", default.angles, "a list of degrees east of north", only(list_of(as_number), bool)
-    )
-    if own and bool(contrasts) != bool(separations):
-        table.complain("", "one of contrasts and separations", "both, or neither")
-    table.finish()
-    return Injections(contrasts, separations, tuple(map(full_circle, angles)))
 
 
 def _is_plain(value: Any) -> bool:

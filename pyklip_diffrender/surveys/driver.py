@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import time
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -16,7 +15,6 @@ from tqdm import tqdm
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import duration, heartbeat
-from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import Work, in_this_process, with_dask
 from pyklip_diffrender.surveys.jobs import (
@@ -27,7 +25,7 @@ from pyklip_diffrender.surveys.jobs import (
     prepare,
     read_record,
     rename_to_jobs,
-    staging,
+    staged,
 )
 from pyklip_diffrender.surveys.stars import StarSearch, search_stars
 from pyklip_diffrender.surveys.survey_page import row, table_of, write_tables
@@ -102,7 +100,7 @@ def survey(
     limit = read_config(config).memory_limit
     work: Work = reduce_job
     if limit is not None:
-        work = partial(reduce_job, memory=_OF_WORKER * to_bytes(limit, "memory_limit"))
+        work = partial(reduce_job, memory=_OF_WORKER * limit)
     return run_survey(config, output, work, scheduler, progress=progress)
 
 
@@ -235,18 +233,14 @@ class _Board:
 
         text = page(self.jobs, self.stars)
         # Written beside the old ones and then moved: whoever reads them meanwhile gets whole files.
-        folder = None
         try:
-            folder = staging(self.output / "jobs", "tables")
-            write_tables(self.rows, folder)
-            (folder / "survey.html").write_text(text, encoding="utf-8")
-            for path in folder.iterdir():
-                os.replace(path, self.output / path.name)
+            with staged(self.output / "jobs", "tables") as folder:
+                write_tables(self.rows, folder)
+                (folder / "survey.html").write_text(text, encoding="utf-8")
+                for path in folder.iterdir():
+                    os.replace(path, self.output / path.name)
         except OSError as error:
             raise IncompatibleSetupError(
                 f"output: the tables cannot be written to {self.output} ({error.strerror}). Make "
                 "room, and start the survey again: finished jobs are kept"
             ) from error
-        finally:
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)

@@ -6,15 +6,14 @@ import hashlib
 import logging
 import math
 import os
-import shutil
 import socket
 import sys
 import time
 import traceback
-from collections import abc, defaultdict, deque
+from collections import abc
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -43,7 +42,7 @@ from pyklip_diffrender.surveys.jobs import (
     finished,
     publish,
     read_record,
-    staging,
+    staged,
     write_record,
 )
 
@@ -88,10 +87,9 @@ def _sequence(job: Job) -> Sequence:
 
 def _options(job: Job, frames: Observation, **changes: Any) -> ReduceOptions:
     """Options of a job's reduction; settings that it does not name are those of the preset."""
-    keywords = {**job.options.keywords, **changes}
-    if job.options.settings:
-        keywords["settings"] = nircam_settings(frames, **job.options.settings)
-    return ReduceOptions(**keywords)
+    own = job.options.settings
+    changes["settings"] = nircam_settings(frames, **own) if own else None
+    return ReduceOptions(**{**vars(job.options), **changes})
 
 
 def _with_disk(
@@ -140,25 +138,29 @@ Work = Callable[[Job, Path], dict[str, Any]]
 """Computes a job, writes its products to a folder, and returns plain values for the record."""
 
 
-def run_job(job: Job, jobs: Path, work: Work) -> Record:
-    """Run a job and publish its folder; returns its record, which says if and why it failed."""
+def run_job(job: Job, jobs: Path, work: Work, base: Record | None = None) -> Record:
+    """Run a job and publish its folder; returns its record, which says if and why it failed.
+
+    `base` is the record of the job whose fit this one starts from, if that was to run as well.
+    """
     final = jobs / job.folder
     known = read_record(final)
     if known is not None and known["status"] == "finished":
         return known
     began = time.perf_counter()
     _reset_peak()
-    folder = None
     try:
+        if base is not None and base["status"] != "finished":
+            raise RefinementError("the reduction without a planet failed, see there")
         _require_same_world(job, jobs)
-        folder = staging(jobs, job.key)
-        result = work(job, folder)
-        record = {**_circumstances(began), "status": "finished", "result": result}
-        whole = write_record(folder, job, record)
-        publish(folder, final)
+        if base is not None and job.base_folder is not None:
+            _appears(jobs / job.base_folder)
+        with staged(jobs, job.key) as folder:
+            result = work(job, folder)
+            record = {**_circumstances(began), "status": "finished", "result": result}
+            whole = write_record(folder, job, record)
+            publish(folder, final)
     except Exception as error:
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
         return failure(job, jobs, error, **_circumstances(began))
     return whole
 
@@ -172,14 +174,9 @@ def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) ->
         "traceback": encodable("".join(traceback.format_exception(error))),
         "result": {},
     }
-    folder = None
-    try:
-        folder = staging(jobs, job.key)
+    with suppress(OSError), staged(jobs, job.key) as folder:
         record = write_record(folder, job, record)
         publish(folder, jobs / job.folder)
-    except OSError:
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
     return record
 
 
@@ -242,58 +239,26 @@ def _peak() -> int | None:
 
 # Jobs run in this process, or by the workers of dask.distributed.
 
-_ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 _CONNECT = 30.0
 """Seconds to wait for a scheduler."""
 
-_PULSE = 0.1
-"""Seconds between looks at what has finished."""
-
-_ALONE = 600.0
-"""Seconds without any worker on this machine after which the survey gives up."""
+_ALONE = "10 minutes"
+"""Time without any worker on this machine after which jobs fail."""
 
 _PATIENCE = 20
 """Half seconds to wait for a folder that another machine has made: network disks lag."""
-
-
-class _Order:
-    """Which jobs can start: injections wait for the job whose fit they start from."""
-
-    def __init__(self, todo: abc.Sequence[Job], jobs: Path) -> None:
-        self.jobs = jobs
-        self.first: list[Job] = []
-        self.later: dict[str, list[Job]] = defaultdict(list)
-        coming = {job.key for job in todo}
-        for job in todo:
-            if job.base in coming:
-                self.later[str(job.base)].append(job)
-            else:
-                self.first.append(job)
-
-    def after(self, job: Job, record: Record) -> tuple[list[Job], list[tuple[Job, Record]]]:
-        """Jobs that can start now that one has ended, and those that failed with it."""
-        waiting = self.later.pop(job.key, [])
-        if record["status"] == "finished":
-            return waiting, []
-        error = RefinementError("the reduction without a planet failed, see there")
-        return [], [(each, failure(each, self.jobs, error)) for each in waiting]
 
 
 def in_this_process(
     todo: abc.Sequence[Job], jobs: Path, work: Work
 ) -> Iterator[tuple[Job, Record]]:
     """Run jobs one after the other; yields each with its record."""
-    order = _Order(todo, jobs)
-    queue = deque(order.first)
-    while queue:
-        job = queue.popleft()
-        record = run_job(job, jobs, work)
-        yield job, record
-        ready, failed = order.after(job, record)
-        queue.extendleft(reversed(ready))
-        yield from failed
+    records: dict[str | None, Record] = {}
+    for job in todo:
+        records[job.key] = run_job(job, jobs, work, records.get(job.base))
+        yield job, records[job.key]
 
 
 def with_dask(
@@ -303,7 +268,7 @@ def with_dask(
     *,
     scheduler: str | None = None,
     workers: int | None = None,
-    memory_limit: str | None = None,
+    memory_limit: float | None = None,
 ) -> Iterator[tuple[Job, Record]]:
     """Run jobs on a cluster, by default on this machine; yields each with its record.
 
@@ -320,27 +285,27 @@ def with_dask(
             f"dask.distributed is needed for more than one process and is not installed ({error}): "
             'python -m pip install "dask[distributed]" pyarrow, or set workers = 0'
         ) from error
-    order = _Order(todo, jobs)
     with ExitStack() as stack:
-        cluster: Any = None
         address: Any = scheduler
         if scheduler is None:
-            stack.enter_context(_without_messages("distributed"))
-            # A worker that is not back after this time is given up, by default after 15 seconds.
-            stack.enter_context(config.set({"distributed.deploy.lost-worker-timeout": "7 days"}))
-            try:
+            stack.enter_context(config.set({
+                # A worker that is not back after this time is given up, by default after 15 s.
+                "distributed.deploy.lost-worker-timeout": "7 days",
+                "distributed.scheduler.no-workers-timeout": _ALONE,
                 # Dask makes glibc give freed memory back at once, which slows fits down.
-                with config.set({f"{_ENVIRONMENT}.MALLOC_TRIM_THRESHOLD_": None}):
-                    cluster = LocalCluster(
-                        n_workers=min(workers or CPU_COUNT, len(todo)),
-                        threads_per_worker=1,
-                        processes=True,
-                        memory_limit=memory_limit or "auto",
-                        # Any free port; None would ask for a certain one, and warn.
-                        dashboard_address="127.0.0.1:0",
-                        silence_logs=logging.CRITICAL,
-                        env=dict.fromkeys(_THREADS, "1"),
-                    )
+                "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
+            }))  # fmt: skip
+            try:
+                cluster = LocalCluster(
+                    n_workers=min(workers or CPU_COUNT, len(todo)),
+                    threads_per_worker=1,
+                    processes=True,
+                    memory_limit=memory_limit or "auto",
+                    # Any free port; None would ask for a certain one, and warn.
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL,
+                    env=dict.fromkeys(_THREADS, "1"),
+                )
             except RuntimeError as error:
                 raise IncompatibleSetupError(
                     f"the worker processes cannot be started ({error}). " + _why_not_spawned()
@@ -354,34 +319,16 @@ def with_dask(
                 "scheduler`, and give the address that it prints, such as tcp://host:8786"
             ) from error
 
-        def submit(each: Job) -> Any:
-            # Two surveys on one scheduler and one folder share their jobs.
-            place = hashlib.sha256(str(jobs).encode()).hexdigest()[:8]
-            return client.submit(run_job, each, jobs, work, key=f"survey-{place}-{each.key}")
-
-        running = {submit(job): job for job in order.first}
-        completed = as_completed(list(running), raise_errors=False)
-        seen = time.monotonic()
-        while running:
-            for future in completed.next_batch(block=False):
-                job = running.pop(future)
-                record = _record_of(future, job, jobs)
-                yield job, record
-                ready, failed = order.after(job, record)
-                for each in ready:
-                    new = submit(each)
-                    running[new] = each
-                    completed.add(new)
-                yield from failed
-            time.sleep(_PULSE)
-            # Those of a cluster elsewhere may wait in a queue for days.
-            if scheduler is not None or cluster.scheduler.workers:
-                seen = time.monotonic()
-            elif time.monotonic() > seen + _ALONE:
-                raise RefinementError(
-                    "no worker process is left, and none can be started. Look at the memory of the "
-                    "machine and start the survey again: finished jobs are kept"
-                )
+        # Two surveys on one scheduler and one folder share their jobs.
+        place = hashlib.sha256(str(jobs).encode()).hexdigest()[:8]
+        futures: dict[str | None, Any] = {}
+        for job in todo:
+            futures[job.key] = client.submit(
+                run_job, job, jobs, work, futures.get(job.base), key=f"survey-{place}-{job.key}"
+            )
+        running = dict(zip(futures.values(), todo, strict=True))
+        for future in as_completed(list(running), raise_errors=False):
+            yield running[future], _record_of(future, running[future], jobs)
 
 
 def _why_not_spawned() -> str:
@@ -399,19 +346,7 @@ def _why_not_spawned() -> str:
     )
 
 
-@contextmanager
-def _without_messages(name: str) -> Iterator[None]:
-    """Silence a library; the survey says itself what became of the job of a worker that died."""
-    logger = logging.getLogger(name)
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
-
-
-def _record_of(future: Any, job: Job, jobs: Path, patience: int = _PATIENCE) -> Record:
+def _record_of(future: Any, job: Job, jobs: Path) -> Record:
     """Record of a job that dask has finished with."""
     final = jobs / job.folder
     known = read_record(final)
@@ -429,13 +364,16 @@ def _record_of(future: Any, job: Job, jobs: Path, patience: int = _PATIENCE) -> 
         # No error of a job gets here.
         if type(error).__name__ != "KilledWorker":
             return failure(job, jobs, error)
+        taken = (
+            "this job" if getattr(error, "task", None) == future.key else "the job without a planet"
+        )
         killed = RefinementError(
-            "every worker that took this job was killed. If they ran out of memory, raise "
+            f"every worker that took {taken} was killed. If they ran out of memory, raise "
             "memory_limit, with fewer workers where the machine has no more"
         )
         killed.__cause__ = error
         return failure(job, jobs, killed)
-    if record["status"] == "finished" and not _appears(final, patience):
+    if record["status"] == "finished" and not _appears(final):
         lost = IncompatibleSetupError(
             f"the worker on {record['host']} wrote its products to another disk than {jobs}. Put "
             "the output on a disk that all workers share"
@@ -444,8 +382,9 @@ def _record_of(future: Any, job: Job, jobs: Path, patience: int = _PATIENCE) -> 
     return record
 
 
-def _appears(final: Path, patience: int) -> bool:
-    for _ in range(patience):
+def _appears(final: Path) -> bool:
+    """Whether a job that has finished elsewhere is seen here, perhaps after a while."""
+    for _ in range(_PATIENCE):
         if finished(final):
             return True
         time.sleep(0.5)

@@ -9,8 +9,8 @@ import os
 import secrets
 import shutil
 import socket
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,6 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import fits_files, read_text, sha256
 from pyklip_diffrender.io.headers import file_name
-from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.scene.associations import listed_files
 from pyklip_diffrender.scene.sequence import epochs_of_files
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
@@ -41,14 +40,11 @@ __all__ = [
     "publish",
     "read_record",
     "rename_to_jobs",
+    "staged",
     "staging",
     "write_record",
 ]
 
-
-_ALWAYS = ("size", "threshold", "systematics", "settings")
-"""Options in the key of every job. Others are in it where they are not as usual, so that jobs of
-configurations without them keep their names."""
 
 _DIGITS = 12
 """Digits of the key at the end of the name of a folder."""
@@ -139,7 +135,7 @@ def jobs_of(config: Config) -> list[Job]:
 
 
 def _jobs(
-    sequence: SequenceConfig, digest: Callable[[Path], str], memory_limit: str | None
+    sequence: SequenceConfig, digest: Callable[[Path], str], memory_limit: float | None
 ) -> list[Job]:
     files = _files(sequence.files)
     planets = sequence.injections
@@ -188,9 +184,9 @@ def _job(
     opd: Path,
     epoch: str | None,
     digest: Callable[[Path], str],
-    memory_limit: str | None,
+    memory_limit: float | None,
 ) -> Job:
-    options, usual = sequence.options, Options()
+    options = sequence.options
     pattern = str(options.systematics)
     known = [] if pattern in ("auto", "references", "off") else _files((Path(pattern),))
     maps = [] if str(opd) == FLAT else [opd]
@@ -198,20 +194,8 @@ def _job(
     members = [each.path for each in listed_files(files) if not each.reason]
     frames = dict.fromkeys((*files, *members))
     inputs = {str(path): digest(path) for path in (*frames, *maps, *known)}
-    chosen = {
-        name: value
-        for name, value in vars(options).items()
-        if name in _ALWAYS or value != getattr(usual, name)
-    }
-    # The error has no effect without the flux.
-    chosen.pop("star_flux_error", None)
-    if options.star_flux is not None:
-        chosen["star_flux"] = [options.star_flux, options.star_flux_error]
-    # Frames of reference stars for which there is no memory are left out.
-    if memory_limit is not None and options.references == "joint" and not options.disk:
-        chosen["memory_limit"] = to_bytes(memory_limit, "memory_limit")
-    facts = {
-        **chosen,
+    facts: dict[str, Any] = {
+        **vars(options),
         "version": __version__,
         "frames": sorted(inputs[str(path)] for path in frames),
         "opd": inputs.get(str(opd), FLAT),
@@ -220,8 +204,11 @@ def _job(
         "systematics": (
             inputs.get(pattern) or sorted(inputs[str(path)] for path in known) or pattern
         ),
-        **({} if epoch is None else {"epoch": epoch}),
+        "epoch": epoch,
     }
+    # Frames of reference stars for which there is no memory are left out.
+    if options.references == "joint" and not options.disk:
+        facts["memory_limit"] = memory_limit
     return Job(
         hash_of(facts),
         sequence.name if epoch is None else f"{sequence.name} {epoch[:10]}",
@@ -275,9 +262,8 @@ def prepare(output: Path) -> Path:
     jobs = output / "jobs"
     try:
         jobs.mkdir(parents=True, exist_ok=True)
-        probe = staging(jobs, "probe")
-        (probe / RECORD).write_bytes(bytes(4096))
-        shutil.rmtree(probe)
+        with staged(jobs, "probe") as probe:
+            (probe / RECORD).write_bytes(bytes(4096))
     except OSError as error:
         raise IncompatibleSetupError(
             f"output: got {output}, expected a folder that can be written to ({error.strerror}). "
@@ -291,6 +277,16 @@ def staging(jobs: Path, key: str) -> Path:
     path = jobs / f".{key}-{os.getpid()}-{secrets.token_hex(4)}@{_place()}"
     path.mkdir()
     return path
+
+
+@contextmanager
+def staged(jobs: Path, key: str) -> Iterator[Path]:
+    """Folder of `staging` that is removed in the end, unless `publish` has renamed it."""
+    folder = staging(jobs, key)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @cache

@@ -24,7 +24,7 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staging
+from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staged
 
 __all__ = ["FOLDER", "StarSearch", "search_stars"]
 
@@ -150,15 +150,13 @@ def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None
         f"../../jobs/{job.folder}": json.loads(read_text(jobs / job.folder / "summary.json"))
         for job, _ in group
     }
-    folder = staging(final.parent, "star")
     try:
-        if isinstance(combination, Combination):
-            combination.write(folder)
-        write_comparison(summaries, folder, combination)
-        os.rename(folder, final)
+        with staged(final.parent, "star") as folder:
+            if isinstance(combination, Combination):
+                combination.write(folder)
+            write_comparison(summaries, folder, combination)
+            os.rename(folder, final)
     except OSError:
         # Another survey of the folder may have been faster.
         if not (final / COMPARISON[1]).exists():
             raise
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)

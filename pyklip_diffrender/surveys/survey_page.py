@@ -11,20 +11,13 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.table import MaskedColumn, Table
-from numpy.typing import NDArray
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
+from pyklip_diffrender.io.progress import duration
 from pyklip_diffrender.reduction import COMPARISON
-from pyklip_diffrender.reduction.pages import (
-    Picture,
-    count,
-    number,
-    plus_minus,
-    render,
-    scientific,
-)
-from pyklip_diffrender.surveys.jobs import Injection, Job, Record
+from pyklip_diffrender.reduction.pages import Picture, count, render
+from pyklip_diffrender.surveys.jobs import Job, Record
 from pyklip_diffrender.surveys.stars import StarSearch
 
 __all__ = ["COLUMNS", "page", "row", "table_of", "write_tables"]
@@ -35,39 +28,42 @@ __all__ = ["COLUMNS", "page", "row", "table_of", "write_tables"]
 _AT = (0.5, 1.0, 1.5, 2.0)
 """Separations of the limits, arcsec."""
 
-COLUMNS: dict[str, type] = {
-    "name": str,
-    "status": str,
-    "contrast": float,
-    "snr": float,
-    "target": str,
-    "filter": str,
-    "frames": int,
-    "fit_status": str,
-    "reduced_chi2": float,
-    "error_factor": float,
-    "candidates": int,
-    "separation_arcsec": float,
-    "position_angle_deg": float,
-    "contrast_error": float,
-    **{f"limit_{each:.1f}_arcsec": float for each in _AT},
-    "injected_contrast": float,
-    "injected_separation_arcsec": float,
-    "injected_angle_deg": float,
-    "recovered_contrast": float,
-    "recovered_error": float,
-    "recovered_snr": float,
-    "recovered": bool,
-    "seconds": float,
-    "peak_memory_bytes": int,
-    "ended": str,
-    "host": str,
-    "message": str,
-    "traceback": str,
-    "folder": str,
-    "key": str,
-}
-"""Columns of the results and what they hold; all but name, status, folder and key may be masked.
+COLUMNS: dict[str, tuple[type, str]] = {
+    "name": (str, "sequence: target and filter, unless the configuration names it"),
+    "status": (str, "of the job: finished, failed or waiting"),
+    "contrast": (
+        float, "of the candidate with the highest S/N, relative to the star without coronagraph",
+    ),
+    "snr": (float, "of that candidate"),
+    "target": (str, ""),
+    "filter": (str, ""),
+    "frames": (int, ""),
+    "fit_status": (str, "how the fit of the star ended"),
+    "reduced_chi2": (float, ""),
+    "error_factor": (float, "median factor by which errors were multiplied"),
+    "candidates": (int, "number of candidates"),
+    "separation_arcsec": (float, "of that candidate from the star"),
+    "position_angle_deg": (float, "of that candidate, east of north"),
+    "contrast_error": (float, "standard deviation of contrast"),
+    **{f"limit_{each:.1f}_arcsec": (float, f"contrast limit at {each:g} arcsec") for each in _AT},
+    "injected_contrast": (float, ""),
+    "injected_separation_arcsec": (float, ""),
+    "injected_angle_deg": (float, ""),
+    "recovered_contrast": (float, ""),
+    "recovered_error": (float, ""),
+    "recovered_snr": (float, ""),
+    "recovered": (bool, "whether a candidate is within 0.1 arcsec of the injected planet"),
+    "seconds": (float, "duration of the job"),
+    "peak_memory_bytes": (int, "largest memory of the job"),
+    "ended": (str, "time at which the job ended, UTC"),
+    "host": (str, ""),
+    "message": (str, ""),
+    "traceback": (str, ""),
+    "folder": (str, "name of the folder with the products, in jobs"),
+    "key": (str, ""),
+}  # fmt: skip
+"""Columns of the results, what they hold, and descriptions; all but name, status, folder and key
+may be masked.
 
 Contrasts come first, because a table that is too wide to print loses its middle."""
 
@@ -75,25 +71,6 @@ _FORMATS = {"contrast": ".2e", "snr": ".1f"}
 
 _UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s, "bytes": u.byte}
 """Units by the last word of the name of a column; limits are contrasts at the separation there."""
-
-_DESCRIPTIONS = {
-    "name": "sequence: target and filter, unless the configuration names it",
-    "status": "of the job: finished, failed or waiting",
-    "contrast": "of the candidate with the highest S/N, relative to the star without coronagraph",
-    "snr": "of that candidate",
-    "fit_status": "how the fit of the star ended",
-    "error_factor": "median factor by which errors were multiplied",
-    "candidates": "number of candidates",
-    "separation_arcsec": "of that candidate from the star",
-    "position_angle_deg": "of that candidate, east of north",
-    "contrast_error": "standard deviation of contrast",
-    **{f"limit_{each:.1f}_arcsec": f"contrast limit at {each:g} arcsec" for each in _AT},
-    "recovered": "whether a candidate is within 0.1 arcsec of the injected planet",
-    "seconds": "duration of the job",
-    "peak_memory_bytes": "largest memory of the job",
-    "folder": "name of the folder with the products, in jobs",
-    "ended": "time at which the job ended, UTC",
-}
 
 
 def row(job: Job, record: Record | None) -> dict[str, Any]:
@@ -129,18 +106,15 @@ def row(job: Job, record: Record | None) -> dict[str, Any]:
 def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The rows as a table, in which what is not known is masked."""
     table = Table()
-    for name, kind in COLUMNS.items():
+    for name, (kind, description) in COLUMNS.items():
         values = [each[name] for each in rows]
         known = [kind() if value is None else kind(value) for value in values]
         table[name] = MaskedColumn(known, mask=[value is None for value in values], dtype=kind)
         table[name].info.format = _FORMATS.get(name)
-        table[name].unit = _unit(name)
-        table[name].description = _DESCRIPTIONS.get(name, "")
+        if not name.startswith("limit_"):
+            table[name].unit = _UNITS.get(name.rpartition("_")[2])
+        table[name].description = description
     return table
-
-
-def _unit(name: str) -> u.UnitBase | None:
-    return None if name.startswith("limit_") else _UNITS.get(name.rpartition("_")[2])
 
 
 def write_tables(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
@@ -152,37 +126,37 @@ def write_tables(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
     from pyarrow import parquet as files
 
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-    schema = pa.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()])
+    schema = pa.schema([(name, kinds[kind]) for name, (kind, _) in COLUMNS.items()])
     table = pa.Table.from_pylist(list(rows), schema=schema)
     files.write_table(table, folder / "results.parquet")
 
 
 # The results of a survey so far, as one HTML page that loads nothing from anywhere.
 
-Rows = Sequence[tuple[Job, Record | None]]
-
-_GIB = 2.0**30
+Jobs = Sequence[tuple[Job, Record | None]]
 
 _NAMES = 3
 """Most sequences that the title names."""
 
 
-def page(rows: Rows, stars: Sequence[StarSearch] = ()) -> str:
+def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
     """The page of jobs with records (None for one that waits), and of the combined searches."""
-    states = [_status(record) for _, record in rows]
+    rows = [{**row(job, record), "label": str(job)} for job, record in jobs]
+    states = [each["status"] for each in rows]
     done, failed, waiting = map(states.count, ("finished", "failed", "waiting"))
     parts = [f"{done} of {count(len(rows), 'job')} finished"]
     parts += [f"{failed} failed"] if failed else []
     parts += [f"{waiting} not finished yet"] if waiting else []
-    seconds = sum(record["seconds"] for _, record in rows if record and "seconds" in record)
-    peak = max((record.get("peak_memory_bytes") or 0 for _, record in rows if record), default=0)
-    separations, limits = _limits(rows)
+    names = list(dict.fromkeys(job.name for job, _ in jobs))
+    more = f"{names[0]} and {len(names) - 1} more sequences"
+    seconds = sum(each["seconds"] or 0.0 for each in rows)
+    injected = sum(job.injection is not None for job, _ in jobs)
     return render(
         "survey.html",
-        name=_title(rows),
+        name=f"Survey of {', '.join(names) if len(names) <= _NAMES else more}",
         version=__version__,
         now=datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
-        sentence=_sentence(rows),
+        sentence=_sentence(jobs),
         tone="bad" if failed else "warn" if waiting else "good",
         message=", ".join(parts) + ".",
         advice=(
@@ -191,60 +165,45 @@ def page(rows: Rows, stars: Sequence[StarSearch] = ()) -> str:
             else ""
         ),
         facts=[
-            ("Sequences", str(sum(job.injection is None for job, _ in rows))),
-            ("Injected planets", str(sum(job.injection is not None for job, _ in rows))),
-            ("Time of all jobs", _time(seconds)),
-            ("Largest memory of a job", _memory(peak)),
+            ("Sequences", len(rows) - injected),
+            ("Injected planets", injected),
+            ("Time of all jobs", duration(seconds) if seconds else "none yet"),
+            (
+                "Largest memory of a job",
+                f"{max(each['peak_memory_bytes'] or 0 for each in rows) / 2**30:.2f} GiB",
+            ),
         ],
-        pictures=_pictures(rows),
-        separations=separations,
-        titles=[f"at {each:.3g} arcsec" for each in separations],
-        limits=limits,
+        rows=rows,
+        pictures=_pictures(jobs),
+        separations=[
+            each for each in _AT if any(row[f"limit_{each:.1f}_arcsec"] is not None for row in rows)
+        ],
         candidates=[
-            (job, record["result"]["target"], each)
-            for job, record in _finished(rows)
-            for each in record["result"].get("candidates", ())
+            {"job": job, "target": result["target"], **each}
+            for job, result in _reduced(jobs)
+            for each in result.get("candidates", ())
         ],
-        stars=[line for each in stars for line in _star(each)],
-        any_injected=any(job.injection for job, _ in rows),
-        injections=_injections(rows),
-        jobs=[_job(job, record) for job, record in rows],
-        failures=[
-            (_label(job), record)
-            for job, record in rows
-            if record is not None and record["status"] == "failed"
+        stars=[
+            (each, found) for each in stars for found in each.combined.get("candidates") or [None]
         ],
+        comparison=COMPARISON[0],
     )
 
 
-def _title(rows: Rows) -> str:
-    """Title of a survey: its sequences, or the first of them and their number."""
-    names = list(dict.fromkeys(job.name for job, _ in rows))
-    if len(names) > _NAMES:
-        return f"Survey of {names[0]} and {len(names) - 1} more sequences"
-    return f"Survey of {', '.join(names)}"
-
-
-def _finished(rows: Rows, *, injected: bool = False) -> list[tuple[Job, Record]]:
+def _reduced(jobs: Jobs) -> list[tuple[Job, dict[str, Any]]]:
+    """Results of the finished jobs without injected planets."""
     return [
-        (job, record)
-        for job, record in rows
-        if record is not None
-        and record["status"] == "finished"
-        and (job.injection is not None) == injected
+        (job, record["result"])
+        for job, record in jobs
+        if record is not None and record["status"] == "finished" and job.injection is None
     ]
 
 
-def _status(record: Record | None) -> str:
-    return "waiting" if record is None else str(record["status"])
-
-
-def _sentence(rows: Rows) -> str:
-    plain = _finished(rows)
-    counts = [len(record["result"].get("candidates", ())) for _, record in plain]
-    if not plain:
+def _sentence(jobs: Jobs) -> str:
+    counts = [len(result.get("candidates", ())) for _, result in _reduced(jobs)]
+    if not counts:
         return "No sequence is reduced yet."
-    stars = count(len(plain), "sequence")
+    stars = count(len(counts), "sequence")
     if not any(counts):
         return f"{stars} reduced, no companion candidate."
     return (
@@ -253,35 +212,25 @@ def _sentence(rows: Rows) -> str:
     )
 
 
-def _curves(rows: Rows) -> list[tuple[Job, Record]]:
-    """Results with a contrast curve."""
-    return [
-        (job, record["result"]) for job, record in _finished(rows) if record["result"].get("curve")
-    ]
-
-
-def _pictures(rows: Rows) -> list[Picture]:
+def _pictures(jobs: Jobs) -> list[Picture]:
     """The contrast curves of all stars; nothing before there is one."""
-    curves = _curves(rows)
-    if not curves:
+    results = [(job.name, each) for job, each in _reduced(jobs) if each.get("curve")]
+    if not results:
         return []
-    sigmas = curves[0][1]["curve"]["sigmas"]
+    sigmas = results[0][1]["curve"]["sigmas"]
     candidates = [
         (each["separation_arcsec"], each["contrast"])
-        for _, result in curves
+        for _, result in results
         for each in result["candidates"]
         if each["contrast"] > 0
     ]
+    # NaN where a contrast is not known.
+    curves = [
+        (name, np.array(curve["separation_arcsec"], float), np.array(curve["contrast"], float))
+        for name, curve in ((name, result["curve"]) for name, result in results)
+    ]
     figure, axes = drawing.new_figure(1, 1)
-    drawing.survey_limits(
-        axes[0, 0],
-        [
-            (job.name, _array(result, "separation_arcsec"), _array(result, "contrast"))
-            for job, result in curves
-        ],
-        candidates,
-        sigmas,
-    )
+    drawing.survey_limits(axes[0, 0], curves, candidates, sigmas)
     picture = Picture(
         "contrast_curves",
         figure,
@@ -291,91 +240,3 @@ def _pictures(rows: Rows) -> list[Picture]:
         "Circles are candidates." if candidates else "",
     )
     return [picture]
-
-
-def _limits(rows: Rows) -> tuple[list[float], list[tuple[str, dict[float, float]]]]:
-    """Separations with limits, and for every star the limits by separation."""
-    limits = [
-        (job.name, {each["separation_arcsec"]: each["contrast"] for each in result["limits"]})
-        for job, result in _curves(rows)
-    ]
-    return sorted({separation for _, each in limits for separation in each}), limits
-
-
-def _array(result: dict[str, Any], key: str) -> NDArray[np.float64]:
-    """A column of the contrast curve, NaN where it is not known."""
-    return np.array(result["curve"][key], dtype=float)
-
-
-def _star(search: StarSearch) -> list[dict[str, str]]:
-    """Rows about the search of a star: one for each candidate, or one that says that none is."""
-    about = {
-        "star": search.star,
-        "page": f"{search.folder}/{COMPARISON[0]}",
-        "jobs": ", ".join(search.jobs),
-        **dict.fromkeys(("separation", "angle", "snr", "false_alarm"), ""),
-    }
-    if "reason" in search.combined:
-        return [{**about, "result": f"no combined search: {search.combined['reason']}"}]
-    left_out = "".join(
-        f" Left out: {each['name']}: {each['reason']}." for each in search.combined["left_out"]
-    )
-    found = [
-        {
-            "result": f"candidate with the spectrum {each['spectrum']}"
-            + (f", {each['verdict']}" if "verdict" in each else "") + f".{left_out}",
-            "separation": plus_minus(each["separation_arcsec"], each["separation_error_arcsec"]),
-            "angle": plus_minus(each["position_angle_deg"], each["position_angle_error_deg"]),
-            "snr": f"{each['snr']:.1f}",
-            "false_alarm": scientific(each["false_alarm_probability"]),
-        }
-        for each in search.combined["candidates"]
-    ]  # fmt: skip
-    return [{**about, **each} for each in found or [{"result": f"no candidate.{left_out}"}]]
-
-
-def _injections(rows: Rows) -> list[tuple[Job, Injection, Record]]:
-    """Injected planets that were measured, and what was measured."""
-    table = []
-    for job, record in _finished(rows, injected=True):
-        planet, seen = job.injection, record["result"].get("recovered")
-        if planet is not None and seen and None not in seen.values():
-            table.append((job, planet, seen))
-    return table
-
-
-def _job(job: Job, record: Record | None) -> dict[str, Any]:
-    """A job and how it went; text is empty where nothing is known."""
-    known: dict[str, Any] = record or {}
-    result = known.get("result") or {}
-    candidates = result.get("candidates")
-    return {
-        "key": job.folder,
-        "label": _label(job),
-        "filter": result.get("filter") or job.filter or "",
-        "status": _status(record),
-        "fit_status": result.get("fit_status") or "",
-        "reduced_chi2": number(result["reduced_chi2"]) if "reduced_chi2" in result else "",
-        "candidates": "" if candidates is None else str(len(candidates)),
-        "time": _time(known["seconds"]) if "seconds" in known else "",
-        "memory": _memory(known["peak_memory_bytes"]) if known.get("peak_memory_bytes") else "",
-    }
-
-
-def _label(job: Job) -> str:
-    planet = job.injection
-    if planet is None:
-        return job.name
-    place = f"{planet.separation:g} arcsec, {planet.angle:g} deg"
-    contrast = scientific(planet.contrast).replace(" ", "\u00a0")
-    return f"{job.name}, planet of {contrast} at {place}"
-
-
-def _time(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-
-
-def _memory(size: float) -> str:
-    return f"{size / _GIB:.2f} GiB"
