@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-__all__ = ["CENTER", "PLACES", "SIDE", "calints", "starlight"]
-
 SIDE = 180
 CENTER = (88.0, 91.0)
 """x, y of the star, 0-indexed."""

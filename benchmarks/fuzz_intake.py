@@ -37,8 +37,6 @@ from pyklip_diffrender.io.files import write_table
 from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["check", "make_frames", "run"]
-
 _CYCLES, _SIZE = 6, 40
 
 _OUTCOMES = ("as untouched", "excluded", "refused", "wrongly refused", "wrong", "crash")

@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 
-__all__ = ["FIGURES", "main"]
-
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 NPIX, SIDE, WAVELENGTH = 128, 40, 4.5e-6

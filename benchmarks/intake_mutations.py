@@ -19,8 +19,6 @@ from scipy.ndimage import shift
 
 import pyklip_diffrender as dr
 
-__all__ = ["MUTATIONS", "Folder"]
-
 Change = Callable[[fits.HDUList, np.random.Generator], None]
 
 

@@ -19,8 +19,6 @@ from pyklip_diffrender.surveys import jobs
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.jobs import jobs_of
 
-__all__ = ["run"]
-
 _HEADER = b"0123456789'=-./ ATFENZe\"{}[],:"
 """What headers, JSON and TOML are made of."""
 

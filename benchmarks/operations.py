@@ -27,9 +27,9 @@ from torch.utils._pytree import tree_leaves
 import pyklip_diffrender as dr
 from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.linear.response import WavefrontResponse
+from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.wavefront.bases import default_basis
-from pyklip_diffrender.wavefront.opd import resample
 
 PEAK = {32: 67e12, 64: 34e12}
 """Operations per second of an H100 SXM without tensor cores, by the bits of a real number: NVIDIA

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import torch
 
-__all__ = ["processor", "provenance"]
-
 
 def processor() -> str:
     """What the machine calls its processor."""

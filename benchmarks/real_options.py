@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-__all__ = ["real_frames_parser"]
-
 
 def real_frames_parser(doc: str | None) -> argparse.ArgumentParser:
     """Make a parser for the folder of frames, the wavefront map, the target and the filter."""

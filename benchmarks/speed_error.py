@@ -55,8 +55,6 @@ from pyklip_diffrender.reduction import ReduceOptions, prepare
 from pyklip_diffrender.refinement import GaussNewton, Refinement, nircam_settings, refine
 from pyklip_diffrender.wavefront.bases import default_basis
 
-__all__ = ["Point", "draw", "main", "measure"]
-
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 MODES_OF_GRADIENTS = 6.0

@@ -19,8 +19,6 @@ from pyklip_diffrender.io.files import open_fits, replacing
 from pyklip_diffrender.io.headers import same_name, unknown_name
 from pyklip_diffrender.io.progress import ProgressBar
 
-__all__ = ["cache_folder", "fetch_calints", "list_calints"]
-
 _TOKEN = "MAST_API_TOKEN"
 
 _UNKNOWN = -1

@@ -39,9 +39,6 @@ from pyklip_diffrender.detection.templates import Templates, groups_of
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["SkyModel", "interpolation_matrix"]
-
-
 # Interpolation of an image at many places, as a sparse matrix.
 
 _KERNEL_REACH = 3

@@ -28,17 +28,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.pattern import PatternRequest
     from pyklip_diffrender.refinement import GaussNewton
 
-__all__ = [
-    "OPTIONS",
-    "Accuracy",
-    "Option",
-    "ReduceKeywords",
-    "ReduceOptions",
-    "References",
-    "SharedOptions",
-]
-
-
 # How an option is declared.
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
-__all__ = ["LEVELS", "OPTICAL_PARAMETERS", "Parameter", "parameter"]
-
 
 @dataclass(frozen=True)
 class Parameter:

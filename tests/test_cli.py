@@ -27,9 +27,10 @@ from pyklip_diffrender.cli import main
 from pyklip_diffrender.cli.session import Run
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import Preparation, ProductFolder, ReduceOptions
 from pyklip_diffrender.surveys import execution
-from pyklip_diffrender.wavefront.opd import random_opd, resample
+from pyklip_diffrender.wavefront.opd import random_opd
 
 # The package has the command under the name of its module.
 application = import_module("pyklip_diffrender.cli.application")

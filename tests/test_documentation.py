@@ -21,7 +21,7 @@ import pytest
 import pyklip_diffrender as dr
 from pyklip_diffrender.cli import application
 from pyklip_diffrender.reduction import ReduceOptions
-from pyklip_diffrender.wavefront.opd import OPDMap
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]

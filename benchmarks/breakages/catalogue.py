@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["BREAKAGES", "Breakage"]
-
 
 class Breakage(NamedTuple):
     """A fault that tests should notice.

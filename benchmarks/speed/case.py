@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Accuracy", "Case", "missing"]
-
 
 @dataclass(frozen=True)
 class Accuracy:

@@ -12,8 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-__all__ = ["draw"]
-
 _INK = "#1b1f24"
 _OURS, _OTHERS = "#5b3f95", "#c0631a"
 _MARKER = 6

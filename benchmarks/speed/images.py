@@ -20,8 +20,6 @@ from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.system import OpticalSystem
 
-__all__ = ["FORWARD", "STEP", "forward", "step"]
-
 FORWARD, STEP = "forward", "forward + backward"
 
 _NAMES = {torch.float64: "float64", torch.float32: "float32"}

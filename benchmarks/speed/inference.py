@@ -23,15 +23,6 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
 
-__all__ = [
-    "JACOBIAN",
-    "MAP",
-    "REFINEMENT",
-    "jacobian",
-    "refinement",
-    "snr_map",
-]
-
 JACOBIAN, REFINEMENT = "Jacobian", "refinement"
 MAP = "S/N map"
 

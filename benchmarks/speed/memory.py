@@ -21,8 +21,6 @@ from benchmarks.speed.case import Case
 from benchmarks.speed.setting import Setting
 from benchmarks.speed.timing import give_back, resident, start_peak
 
-__all__ = ["memory_of", "peak_memory"]
-
 ROOT = Path(__file__).resolve().parents[2]
 
 

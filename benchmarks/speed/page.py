@@ -13,8 +13,6 @@ from astropy.table import Table
 
 from pyklip_diffrender.io.files import replacing
 
-__all__ = ["page", "targets", "write_page"]
-
 _TARGETS: tuple[tuple[str, str, str, str, float, float, str], ...] = (
     # row, case, precision, against, at least, error at most, which error
     ("forward", "this package, 1024", "float64", "stpsf calc_psf, fft_oversample 4", 100, 1e-7,

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import MASKS
 
-__all__ = ["plain_poppy", "plain_stpsf"]
-
 Array = NDArray[np.float64]
 
 

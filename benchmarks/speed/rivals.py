@@ -22,8 +22,6 @@ from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import kernel
 
-__all__ = ["hcipy_image", "load", "paper_recipe", "prysm_image"]
-
 Array = NDArray[np.float64]
 Image = Callable[[], Array]
 

@@ -19,8 +19,6 @@ from benchmarks.speed.scaling import SCALING, scaling
 from benchmarks.speed.setting import Setting
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["ROWS", "Row", "cases_of", "select_rows"]
-
 
 @dataclass(frozen=True)
 class Row:

@@ -21,8 +21,6 @@ from pyklip_diffrender.refinement import GaussNewton, refine
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
 
-__all__ = ["SCALING", "limits", "scaling"]
-
 SCALING = "scaling"
 
 

@@ -25,9 +25,6 @@ from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
 sys.path.append(str(Path(__file__).parents[2] / "examples" / "paper"))
-from coarse import coarse_steps
-
-__all__ = ["Arrays", "Setting", "coarse_steps"]
 
 Array = NDArray[np.float64]
 

@@ -14,16 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = [
-    "exponent",
-    "give_back",
-    "interleaved",
-    "resident",
-    "seconds",
-    "start_peak",
-    "synchronise",
-]
-
 _FEWEST_ROUNDS = 3
 
 _SHORT = 0.05

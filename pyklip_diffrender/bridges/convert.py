@@ -44,8 +44,6 @@ from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import Detector, Plane
 
-__all__ = ["Conversion"]
-
 Array = NDArray[Any]
 
 

@@ -37,23 +37,6 @@ from pyklip_diffrender.optics.planes import (
     cached,
 )
 
-__all__ = [
-    "COMPACT_OPTICS",
-    "Box",
-    "BoxPart",
-    "FourierMask",
-    "ImageSamples",
-    "MaskPart",
-    "MaskStack",
-    "Part",
-    "SampledOcculter",
-    "SeparablePart",
-    "complement_box",
-    "padded_pupil",
-    "pupil_phasor",
-]
-
-
 Box = tuple[float, float, float, float]
 """Lower x, upper x, lower y, upper y in arcsec."""
 

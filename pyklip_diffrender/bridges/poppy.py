@@ -25,15 +25,6 @@ from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.planes import Detector
 from pyklip_diffrender.optics.system import OpticalSystem, poppy_psf, refuse_keywords
 
-__all__ = [
-    "PoppySystem",
-    "check_supported",
-    "from_poppy",
-    "intermediate_wavefronts",
-    "opd_to_poppy",
-]
-
-
 # The fields at all planes as `poppy.Wavefront` objects.
 
 Array = NDArray[Any]

@@ -33,21 +33,6 @@ from pyklip_diffrender.optics.planes import (
 )
 from pyklip_diffrender.parameters import parameter
 
-__all__ = [
-    "AberrationOptic",
-    "FreeRotation",
-    "Gain",
-    "MovableStop",
-    "Orientation",
-    "OrientedPupil",
-    "PupilOptic",
-    "SplineRotation",
-    "free_turn",
-    "is_quarter_turn",
-    "turns_behind",
-]
-
-
 # Flips and quarter turns between the frames of successive planes, kept exact; other turns.
 
 Matrix = tuple[tuple[int, int], tuple[int, int]]

@@ -45,19 +45,6 @@ from pyklip_diffrender.optics.system import (
 )
 from pyklip_diffrender.wavefront.opd_map import check_opd, opd_to_hdus
 
-__all__ = [
-    "WebbSystem",
-    "band",
-    "data_errors",
-    "from_webbpsf",
-    "kernel_files_left_open",
-    "opd_to_webbpsf",
-    "oversampling",
-    "private_copy",
-    "with_effects",
-]
-
-
 # Read the settings and the detector of an stpsf instrument without changing it.
 
 Array = NDArray[np.float64]

@@ -41,19 +41,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.scene.sequence import Sequence
     from pyklip_diffrender.wavefront.opd import Rule
 
-__all__ = [
-    "application",
-    "demo",
-    "detect_in_file",
-    "doctor",
-    "learn",
-    "main",
-    "psf",
-    "reduce_frames",
-    "survey",
-]
-
-
 # The commands that compute something.
 
 _DEMO = ("demo.png", "demo.fits", "demo.ecsv", "candidates.ecsv")
@@ -296,7 +283,8 @@ def psf(
 
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
     from pyklip_diffrender.io.headers import fits_text
-    from pyklip_diffrender.wavefront.opd import as_opd_map, resample
+    from pyklip_diffrender.optics.grid import resample
+    from pyklip_diffrender.wavefront.opd import as_opd_map
 
     model = nircam_coronagraph(
         filter,

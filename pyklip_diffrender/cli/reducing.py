@@ -47,14 +47,6 @@ from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
-__all__ = [
-    "describe_steps",
-    "map_for",
-    "run",
-    "run_reduction",
-]
-
-
 # The work of the commands `reduce` and `detect`.
 
 _MAST = "mast"

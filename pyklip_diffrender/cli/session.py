@@ -23,29 +23,6 @@ from pyklip_diffrender.options import OPTIONS, ReduceOptions
 if TYPE_CHECKING:
     from pyklip_diffrender.io.files import OutputFolder
 
-__all__ = [
-    "COMMON",
-    "PROGRAM",
-    "Command",
-    "Run",
-    "archive",
-    "common",
-    "declared",
-    "file_type",
-    "free_memory",
-    "keep_freed_memory",
-    "named_files",
-    "open_streams",
-    "option",
-    "outputs",
-    "require_frames",
-    "require_in_place",
-    "search",
-    "together",
-    "wavefront",
-]
-
-
 # Memory of this process, and what the machine has left.
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3

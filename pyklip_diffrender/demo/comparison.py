@@ -37,10 +37,8 @@ from pyklip_diffrender.scene.objects import (
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import planet_photons, simulate, star_photons
-from pyklip_diffrender.wavefront.opd import OPDMap, random_drift, random_opd
-
-__all__ = ["DITHERS", "DemoResult", "draw_demo", "run_demo", "simulate_references", "write_demo"]
-
+from pyklip_diffrender.wavefront.opd import random_drift, random_opd
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 _log = logging.getLogger(__name__)
 

@@ -26,26 +26,6 @@ from pyklip_diffrender.refinement import FrameFit, Refinement, refine_again, sta
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = [
-    "Candidates",
-    "Maps",
-    "ReferenceSource",
-    "are_companions",
-    "calibration_errors",
-    "candidate_errors",
-    "caveats",
-    "count_rolls",
-    "in_derivatives",
-    "lacks_candidates",
-    "refine_candidates",
-    "sources_of_references",
-    "unconfirmed_companions",
-    "with_companions",
-    "with_position_of_star",
-    "without_light",
-]
-
-
 _log = logging.getLogger(__name__)
 
 _ITERATIONS = 12

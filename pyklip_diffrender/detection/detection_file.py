@@ -32,17 +32,6 @@ from pyklip_diffrender.refinement.fit_file import (
 )
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
-__all__ = [
-    "digest",
-    "image_hdu",
-    "provenance_of",
-    "read_detection",
-    "searched_fits",
-    "write_astrometry",
-    "write_detection",
-]
-
-
 # Positions of candidates as programs that fit orbits read them.
 
 _JD = 2400000.5

@@ -54,9 +54,6 @@ from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
-__all__ = ["ConnectedLight", "Disk", "fit_disk"]
-
-
 # Which light of sources on a grid is extended, and which is that of point sources.
 #
 # The brightness of the sources is smoothed by a beam of lambda/D. Of all straight lines of a given

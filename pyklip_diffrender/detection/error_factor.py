@@ -42,18 +42,6 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.refinement.residual import local_maxima
 
-__all__ = [
-    "CLIP",
-    "ErrorFactor",
-    "Scatter",
-    "Significance",
-    "compact_structures",
-    "contrast_table",
-    "curve_table",
-    "structures_in_single_roll",
-]
-
-
 _WINGS = 1.5
 """Resolution elements about a source whose S/N is not used: about the size of its image."""
 

@@ -15,20 +15,6 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import full_circle, require_finite, to_arcsec
 from pyklip_diffrender.refinement import Refinement, jansky_per_unit, star_flux_error
 
-__all__ = [
-    "Positions",
-    "Sky",
-    "curve_separations",
-    "far_from",
-    "pixel_width",
-    "pixels_of",
-    "reaching",
-    "require_inside",
-    "ring_pixels",
-    "separation_of",
-]
-
-
 Image = NDArray[np.float64]
 
 

@@ -35,22 +35,6 @@ from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-__all__ = [
-    "candidate_table",
-    "chi2_by_ring",
-    "contrasts_at",
-    "default_factor",
-    "error_inflation",
-    "follows_scatter",
-    "in_words",
-    "magnitudes",
-    "measured_shape",
-    "measured_table",
-    "significance_of",
-    "subtracted_frames",
-]
-
-
 _ROUNDS = 5
 """Largest number of refinements of the star for a bright extended source."""
 

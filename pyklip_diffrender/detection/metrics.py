@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 
-__all__ = ["annulus_snr", "star_model_error", "throughput"]
-
 Image = NDArray[np.float64]
 Position = tuple[float, float]
 

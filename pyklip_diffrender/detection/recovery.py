@@ -26,16 +26,6 @@ from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = [
-    "CLEAR",
-    "completeness",
-    "contrast_of_completeness",
-    "measured_planet",
-    "recover_planets",
-    "with_planets",
-]
-
-
 _STRENGTH = 1.6
 """Contrast of an injected planet over the limit with the small-sample correction, which is the
 threshold of the search. At a limit of 5 sigma, nearly all planets of 8 sigma should be detected."""

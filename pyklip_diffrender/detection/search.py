@@ -44,13 +44,6 @@ from pyklip_diffrender.io.units import require_positive, to_arcsec
 from pyklip_diffrender.refinement import Refinement, Status
 from pyklip_diffrender.refinement.residual import local_maxima
 
-__all__ = [
-    "detect",
-    "side_lobes",
-    "with_raised_peaks",
-]
-
-
 # Candidates that are side lobes of a source nearer to the star than the search goes.
 #
 # Such a source can end a fit at a wrong wavefront, whose residuals elsewhere look like planets.

@@ -52,9 +52,6 @@ from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import ccd_data, world_coordinates
 
-__all__ = ["Detection", "draw_curve", "draw_search"]
-
-
 # The figure of a search: its S/N map and its contrast curve.
 
 

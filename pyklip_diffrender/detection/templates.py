@@ -20,9 +20,6 @@ from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-__all__ = ["Group", "Templates", "combine_frames", "groups_of", "has_only_reference_stars", "weigh"]
-
-
 _FINE = 3
 """Positions of sources per pixel, along x and y, in frames where they are not at pixel centres. A
 source that stands a sixth of a pixel from its template loses 0.5 % of its S/N in a map; candidates

@@ -35,17 +35,6 @@ from pyklip_diffrender.scene.observation import Observation, Window
 if TYPE_CHECKING:
     from photutils.psf import ImagePSF
 
-__all__ = [
-    "EDGE",
-    "REACH",
-    "WholeFrame",
-    "has_bright_pixels_beyond",
-    "sources_at_edges",
-    "sources_beyond",
-    "without_blurred_edges",
-]
-
-
 EDGE = 16
 """Pixels within the last valid rows and columns that are not searched: templates are cut off there,
 and light scattered by the edge of the occulters' substrate appears in the first rows of every

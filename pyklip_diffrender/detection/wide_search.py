@@ -48,9 +48,6 @@ from pyklip_diffrender.scene.simulation import within_field
 if TYPE_CHECKING:
     pass
 
-__all__ = ["WideField", "require_outer_pixels", "wide_field"]
-
-
 # The result of a search of whole frames.
 
 

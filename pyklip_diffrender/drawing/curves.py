@@ -14,8 +14,6 @@ from pyklip_diffrender.drawing.figures import ACCENT, INK, halo
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["contrast_curve", "injected_planets", "survey_limits"]
-
 _KLIP = "#b3541e"
 """A brown, lighter than the green of the curve that it is drawn beside."""
 

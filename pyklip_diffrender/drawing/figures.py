@@ -19,23 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "ACCENT",
-    "INK",
-    "axes_for",
-    "circles",
-    "compass",
-    "halo",
-    "label_sky",
-    "new_figure",
-    "panel",
-    "save",
-    "to_png",
-    "unit_label",
-    "wide_panel",
-]
-
-
 # Marks on images: labels of axes, circles, a compass.
 
 INK = "#1b1f24"

@@ -18,17 +18,6 @@ from pyklip_diffrender.drawing.figures import INK, circles, compass, label_sky
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "SNR_LINEAR",
-    "light_norm",
-    "pupil_image",
-    "show_pixels",
-    "signed_image",
-    "snr_map",
-    "star_image",
-    "wavefront_map",
-]
-
 Image = NDArray[np.float64]
 
 _LIGHT = "magma"

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Epoch", "Stamp", "corner", "sky_track", "stamp_panels"]
-
 Array = NDArray[np.float64]
 
 _STAMPS, _CORNER = (4.8, 3.9), (4.8, 4.4)

@@ -15,15 +15,6 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import embedded_table
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
 
-__all__ = [
-    "TABULATED_GAP",
-    "is_jwst_pupil",
-    "jwst_pupil",
-    "jwst_segments",
-    "maskbar_openings",
-    "maskrnd_openings",
-]
-
 TABULATED_GAP = 7.68e-3
 """Distance between neighbouring segments of the embedded outlines, m."""
 

@@ -17,21 +17,6 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import embedded_table
 from pyklip_diffrender.optics.grid import STAR_RADIUS
 
-__all__ = [
-    "FIELD",
-    "FILTERS",
-    "MASKS",
-    "BarMask",
-    "DetectorPlace",
-    "RoundMask",
-    "detector_place",
-    "filter_shift",
-    "is_short_wave",
-    "mask_of_header",
-    "require_mask",
-    "stop_is_measured",
-]
-
 _SECOND_ZERO_OF_J1 = 7.015586669815619
 
 SHORT_WAVE = ("F182M", "F187N", "F200W", "F210M", "F212N")

@@ -35,16 +35,6 @@ from pyklip_diffrender.optics.planes import (
 from pyklip_diffrender.optics.system import OpticalSystem, Value
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 
-__all__ = [
-    "FLIGHT_ALIGNMENT",
-    "NIRCAM_LW_PIXELSCALE",
-    "ChromaticAberration",
-    "internal_wavefront_error",
-    "nircam_coronagraph",
-    "parity_in_y",
-]
-
-
 # NIRCam's internal wavefront error behind the Lyot stop, and its dependence on wavelength.
 #
 # Tables are in the orientation of the exit pupil, in which y is inverted. Functions return the

@@ -34,20 +34,6 @@ from pyklip_diffrender.io.files import embedded_table, open_fits, read_bytes
 from pyklip_diffrender.io.units import native_float64, to_metres, to_number, to_unit, unit_of
 from pyklip_diffrender.optics.bandpass import Bandpass
 
-__all__ = [
-    "TEMPERATURES",
-    "PlanetSpectra",
-    "blackbody",
-    "filter_bandpass",
-    "filter_throughput",
-    "mean_in_filter",
-    "planet_spectra",
-    "read_spectrum",
-    "require_star",
-    "star_flux_density",
-]
-
-
 _log = logging.getLogger(__name__)
 
 _Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]

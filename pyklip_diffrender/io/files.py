@@ -31,28 +31,6 @@ from pyklip_diffrender.errors import (
     MissingFileError,
 )
 
-__all__ = [
-    "BROKEN",
-    "OutputFolder",
-    "embedded_table",
-    "fits_files",
-    "is_fits_name",
-    "moved_aside",
-    "open_fits",
-    "product_in",
-    "read_bytes",
-    "read_image",
-    "read_text",
-    "replacing",
-    "require_new",
-    "sha256",
-    "stamps",
-    "unpacked_name",
-    "without_fits_suffix",
-    "write_fits",
-    "write_table",
-]
-
 _GZIP = b"\x1f\x8b"
 
 _IN_MEMORY = 2**25

@@ -17,26 +17,6 @@ from astropy.time import Time
 
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 
-__all__ = [
-    "KEYWORDS",
-    "Keyword",
-    "card_error",
-    "day_and_time",
-    "fits_text",
-    "fits_unit",
-    "header_date",
-    "header_number",
-    "header_text",
-    "known_number",
-    "known_text",
-    "merged_header",
-    "same_name",
-    "sensing_date",
-    "set_keyword",
-    "unknown_name",
-]
-
-
 # Names of stars and filters, which archives and observers spell differently.
 
 _SIMBAD = re.compile(r"(V|NAME|\*+)?\*?[\s_-]+", re.IGNORECASE)

@@ -8,8 +8,6 @@ from typing import Any
 
 from astropy.table import Table
 
-__all__ = ["html_summary"]
-
 _MOST_ROWS = 20
 
 

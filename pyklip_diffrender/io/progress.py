@@ -14,15 +14,6 @@ from typing import Self
 
 from tqdm import tqdm
 
-__all__ = [
-    "ProgressBar",
-    "duration",
-    "heard_by",
-    "heartbeat",
-    "numbered_stages",
-    "stage",
-]
-
 _log = logging.getLogger(__name__)
 
 _STAGE: ContextVar[str] = ContextVar("stage", default="")

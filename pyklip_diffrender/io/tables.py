@@ -10,8 +10,6 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable, Table
 
-__all__ = ["Column", "add_columns", "labelled", "plain_rows"]
-
 Column = tuple[str, Any, Any, str, str]
 """Name, values, unit or None, format and description; the last two may be empty."""
 

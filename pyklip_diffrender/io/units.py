@@ -25,29 +25,6 @@ from pyklip_diffrender.errors import (
     UnitError,
 )
 
-__all__ = [
-    "ARCSEC",
-    "Bound",
-    "full_circle",
-    "half_circle",
-    "native_float64",
-    "require_bound",
-    "require_finite",
-    "require_positive",
-    "require_shape",
-    "rotation_matrix",
-    "set_numbers",
-    "to_arcsec",
-    "to_mask",
-    "to_metres",
-    "to_number",
-    "to_pair",
-    "to_unit",
-    "unit_of",
-    "warn_of_rms",
-]
-
-
 # Angles, and rotations of positions in a plane.
 
 Angle = TypeVar("Angle", float, NDArray[np.float64])

@@ -28,18 +28,6 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 
-__all__ = [
-    "FrameRows",
-    "LinearFrame",
-    "LinearModel",
-    "Noise",
-    "TemplateProducts",
-    "Unknown",
-    "pixel_pieces",
-    "summed_rows",
-]
-
-
 # The unknowns of a linear model, and the part that one frame has in it.
 
 _PIXELS = 1024

@@ -20,22 +20,6 @@ from pyklip_diffrender.optics.system import OpticalSystem, Propagation, batch_of
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.wavefront.bases import Basis, FourierModes, fourier_part
 
-__all__ = [
-    "NANOMETRE",
-    "LastPupil",
-    "ModeFields",
-    "Reading",
-    "ResponseCache",
-    "WavefrontResponse",
-    "coarse_copy",
-    "coarse_npix",
-    "downsample",
-    "field_derivatives",
-    "image_derivatives",
-    "jacobian",
-]
-
-
 # Derivatives of the complex field on the detector with respect to wavefront modes.
 
 NANOMETRE = 1e-9

@@ -9,8 +9,6 @@ import numpy as np
 
 from pyklip_diffrender.errors import ShapeError
 
-__all__ = ["Bandpass"]
-
 
 @dataclass(frozen=True)
 class Bandpass:

@@ -30,16 +30,6 @@ from pyklip_diffrender.optics.planes import (
     tilt_phases,
 )
 
-__all__ = [
-    "DEFAULT_SAMPLING",
-    "LatticeRoute",
-    "OcculterLattice",
-    "PlaneWaves",
-    "ShiftedTransforms",
-    "finest_spacing",
-]
-
-
 # An occulter by convolution on a lattice aligned with the detector's samples.
 #
 # Notation: E is the field in the pupil in front of the occulter, t the occulter's transmission, L

@@ -18,21 +18,6 @@ from torch import Tensor
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.units import ARCSEC, native_float64
 
-__all__ = [
-    "JWST_DIAMETER",
-    "STAR_RADIUS",
-    "PupilGrid",
-    "doubled_samples",
-    "noll_indices",
-    "polygon_coverage",
-    "resample",
-    "samples_for_field",
-    "transform_polygons",
-    "widen_polygon",
-    "zernike_basis",
-]
-
-
 JWST_DIAMETER = 6.603464
 """Circumscribed diameter of the primary, m (stpsf.constants 2.2.0)."""
 

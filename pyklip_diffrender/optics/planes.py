@@ -47,35 +47,6 @@ from pyklip_diffrender.optics.grid import (
     zernike_basis,
 )
 
-__all__ = [
-    "Cache",
-    "ChainDetector",
-    "CompactOcculter",
-    "Detector",
-    "Effect",
-    "EntrancePupil",
-    "GaussianBlur",
-    "InternalAberration",
-    "LinearResampling",
-    "LyotStop",
-    "MatrixFourier",
-    "PixelCrosstalk",
-    "Plane",
-    "Position",
-    "Values",
-    "Wavefront",
-    "cached",
-    "centred",
-    "has_memory",
-    "is_plain",
-    "kernel",
-    "mirrored_convolution",
-    "phase_factor",
-    "position_of",
-    "tilt_phases",
-]
-
-
 # Distinguish differentiated tensors from constants, whose results may be cached.
 
 Key = TypeVar("Key", bound=Hashable)

@@ -41,9 +41,6 @@ from pyklip_diffrender.optics.planes import (
 )
 from pyklip_diffrender.optics.system import OpticalSystem, Value, batch_of
 
-__all__ = ["PointSources"]
-
-
 Index = ArrayLike | Tensor
 
 _log = logging.getLogger(__name__)

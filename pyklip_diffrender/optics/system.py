@@ -35,20 +35,6 @@ from pyklip_diffrender.optics.planes import (
 )
 from pyklip_diffrender.parameters import parameter
 
-__all__ = [
-    "OpticalSystem",
-    "Propagation",
-    "Value",
-    "batch_of",
-    "instrument_psf",
-    "one_thread_after_fork",
-    "poppy_psf",
-    "refuse_keywords",
-    "require_one_sampling",
-    "save",
-]
-
-
 # Threads of torch in processes that are made by a fork.
 
 _registered = False

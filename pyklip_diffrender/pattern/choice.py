@@ -34,18 +34,7 @@ from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.jwst_files import shift_frames, shift_variances
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics, shows_star
-from pyklip_diffrender.wavefront.opd import OPDMap
-
-__all__ = [
-    "PatternChoice",
-    "PatternRequest",
-    "ReferenceFrames",
-    "as_request",
-    "choose_systematics",
-    "fit_with_pattern",
-    "place_on_detector",
-]
-
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # Find which pixels of the detector frames show, from the pattern of the flat field itself.
 #

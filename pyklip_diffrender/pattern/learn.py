@@ -54,8 +54,6 @@ from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import wavefront_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
-__all__ = ["learn_library"]
-
 _log = logging.getLogger(__name__)
 
 Files = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]

@@ -48,8 +48,6 @@ from pyklip_diffrender.scene.systematics import (
     unrecorded,
 )
 
-__all__ = ["PatternLibrary", "combine_libraries", "known_systematics", "package_library"]
-
 _SETUP = {"filter", "mask", "detector"}
 """What both a pattern of a library and the frames that it is for must state."""
 

@@ -26,25 +26,6 @@ from pyklip_diffrender.scene.exposure import (
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 
-__all__ = [
-    "FEW_PIXELS",
-    "OUTLIER",
-    "MeasuredPattern",
-    "combine_patterns",
-    "common_pedestal",
-    "flat_of",
-    "lacks_pattern",
-    "learn_systematics",
-    "light_and_residual",
-    "measure_patterns",
-    "median_variance",
-    "pattern_pedestal",
-    "pattern_size",
-    "rings_about",
-    "widths_from_star",
-]
-
-
 # The pedestal of a pattern: light besides the star that the pattern multiplies.
 
 Image = NDArray[np.float64]

@@ -25,22 +25,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
-from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
+from pyklip_diffrender.wavefront.opd import wavefront_for
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.pattern import PatternLibrary
     from pyklip_diffrender.refinement import GaussNewton
     from pyklip_diffrender.scene.systematics import Systematics
-
-__all__ = [
-    "ATTRIBUTE",
-    "IMAGES",
-    "DiffrenderSettings",
-    "OPDLike",
-    "settings_of",
-    "starting_opd",
-    "thread_limit",
-]
 
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
 """A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""

@@ -48,17 +48,6 @@ from pyklip_diffrender.scene.integrations import checked_stacks, compressed, mas
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 
-__all__ = [
-    "Admitted",
-    "Frames",
-    "admit",
-    "date_of_frames",
-    "frames_of",
-    "library_files",
-    "observation_from_dataset",
-    "require_frames",
-]
-
 _log = logging.getLogger(__name__)
 
 

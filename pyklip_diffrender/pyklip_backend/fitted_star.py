@@ -19,14 +19,11 @@ from pyklip_diffrender.pyklip_backend.source_frames import Pointing
 from pyklip_diffrender.scene.jwst_files import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.simulation import field_of
-from pyklip_diffrender.wavefront.opd import OPDMap
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.reduction.pipeline import ReductionResult
     from pyklip_diffrender.refinement import FrameFit, Refinement
-
-__all__ = ["Fit", "FittedPointing", "Subtraction", "Subtractor", "counted"]
-
 
 # One pointing of a fit: the star, and other sources, on the pixels of its frames.
 

@@ -29,15 +29,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.detection.error_factor import ErrorFactor
     from pyklip_diffrender.refinement import Refinement
 
-__all__ = [
-    "PlanetInFrame",
-    "check_forward_model",
-    "is_planet",
-    "planet_cards",
-    "planet_in_frames",
-]
-
-
 Filter = Callable[[NDArray[Any]], NDArray[Any]]
 
 _APERTURE = 4.0

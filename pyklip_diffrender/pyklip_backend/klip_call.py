@@ -63,25 +63,7 @@ from pyklip_diffrender.pyklip_backend.output_files import (
 )
 from pyklip_diffrender.pyklip_backend.source_frames import ATTRIBUTE, why_without_source
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
-from pyklip_diffrender.wavefront.opd import OPDMap
-
-__all__ = [
-    "RESULTS",
-    "Annuli",
-    "DatasetReduction",
-    "ForwardReduction",
-    "aligned_before",
-    "annuli_of",
-    "check_arguments",
-    "check_dataset",
-    "fill",
-    "mark_filtered",
-    "noise_cube",
-    "place",
-    "slices",
-    "subtract_from_copy",
-]
-
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # Place and mask subtracted frames the way pyKLIP's `klip_parallelized` does.
 

@@ -27,7 +27,7 @@ from pyklip_diffrender.io.headers import fits_text, set_keyword
 from pyklip_diffrender.pyklip_backend.dataset_frames import Frames
 from pyklip_diffrender.pyklip_backend.fitted_star import Subtraction
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.opd import OPDMap
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -37,20 +37,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
     from pyklip_diffrender.refinement import Refinement
-
-__all__ = [
-    "ProductImages",
-    "ReductionRecord",
-    "folder_and_prefix",
-    "image_of",
-    "on_product",
-    "provenance",
-    "staging",
-    "stamp",
-    "throughput_map",
-    "write_throughput",
-]
-
 
 # The images that products carry in place of the frames minus their star.
 

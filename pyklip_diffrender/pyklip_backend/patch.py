@@ -10,8 +10,6 @@ from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["PatchedFunction", "PatchedMethod"]
-
 logger = logging.getLogger(__name__)
 
 

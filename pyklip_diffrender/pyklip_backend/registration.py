@@ -29,25 +29,6 @@ from pyklip_diffrender.pyklip_backend.output_files import ReductionRecord
 from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 from pyklip_diffrender.pyklip_backend.source_frames import keeping_references, keeping_source
 
-__all__ = [
-    "ALGORITHM",
-    "BLOCK",
-    "REGISTRY",
-    "Patched",
-    "Patches",
-    "backend",
-    "dispatch",
-    "dispatch_fm",
-    "is_ours",
-    "is_registered",
-    "reduce_jwst_files",
-    "register",
-    "settings_for",
-    "unregister",
-    "warn_of_klip",
-]
-
-
 # Who uses the backend in this process, with which settings, and which calls are for it.
 
 ALGORITHM = "diffrender"

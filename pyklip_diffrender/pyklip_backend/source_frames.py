@@ -34,26 +34,6 @@ from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, SHIFTS, single_pr
 from pyklip_diffrender.scene.observation import Observation, frames_in
 from pyklip_diffrender.scene.sequence import Sequence
 
-__all__ = [
-    "ATTRIBUTE",
-    "REFERENCES",
-    "FrameDetails",
-    "JudgedFiles",
-    "NotRecordedError",
-    "OpenedFile",
-    "Pointing",
-    "Recorded",
-    "SourceFrames",
-    "judged_before",
-    "keeping_references",
-    "keeping_source",
-    "part_of",
-    "pointings_of",
-    "read_source",
-    "recorded_frames",
-    "why_without_source",
-]
-
 _log = logging.getLogger(__name__)
 
 ATTRIBUTE = "_diffrender_source"

@@ -24,16 +24,13 @@ from pyklip_diffrender.pyklip_backend.source_frames import Pointing, pointings_o
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
 from pyklip_diffrender.scene.simulation import model_for
-from pyklip_diffrender.wavefront.opd import OPDMap
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.detection import Detection
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import PatternRequest
     from pyklip_diffrender.refinement import Refinement
-
-__all__ = ["FIT_PIXELS", "model_of", "subtract_by_refinement"]
-
 
 _log = logging.getLogger(__name__)
 

@@ -33,9 +33,6 @@ from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.scene.jwst_files import shift_frames
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["KlipSubtraction", "klip_curve", "klip_image", "klip_rdi", "small_sample_factor"]
-
-
 # KLIP by pyKLIP on arrays in memory, for comparisons.
 
 

@@ -21,23 +21,6 @@ from pyklip_diffrender.refinement import Status
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = [
-    "FIGURE_FORMATS",
-    "Picture",
-    "advice",
-    "count",
-    "depth_against_klip",
-    "number",
-    "plus_minus",
-    "position_angle",
-    "probability",
-    "render",
-    "scientific",
-    "sentence",
-    "write_figures",
-]
-
-
 # Numbers and results in words.
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -36,9 +36,6 @@ from pyklip_diffrender.scene.observation import Window
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 from pyklip_diffrender.scene.star_place import without_gaps
 
-__all__ = ["MOST_FRAMES", "Klip", "Overview", "ReportPictures", "SkyImages"]
-
-
 # Images of the sky about the star with north up, of all frames together.
 
 Image = NDArray[np.float64]

@@ -76,23 +76,8 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import OF_ANOTHER_EPOCH, Sequence
 from pyklip_diffrender.scene.simulation import model_for, within_field
 from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
-from pyklip_diffrender.wavefront.opd import OPDMap, wavefront_for
-
-__all__ = [
-    "MAX_CHI2",
-    "Keeper",
-    "Preparation",
-    "ReductionResult",
-    "frames_for_pattern",
-    "frames_in_likelihood",
-    "looks_extended",
-    "on_extended_light",
-    "prepare",
-    "reduced_chi2",
-    "require_plausible",
-    "warn_of_status",
-]
-
+from pyklip_diffrender.wavefront.opd import wavefront_for
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # Whether a fit may be subtracted, and what to say about one that has not converged.
 

@@ -28,16 +28,6 @@ from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures,
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import summarise
 
-__all__ = [
-    "PRODUCTS",
-    "ProductFolder",
-    "existing_products",
-    "page",
-    "write_products",
-    "write_report",
-]
-
-
 # The report: what its page shows of a summary, and its pictures.
 
 _PHOTOMETRY = (

@@ -13,8 +13,6 @@ from pyklip_diffrender.reduction.pipeline import ReductionResult, prepare
 from pyklip_diffrender.reduction.products import ProductFolder
 from pyklip_diffrender.scene.sequence import Sequence
 
-__all__ = ["Reduction", "reduce"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reduction(ReductionResult):

@@ -26,8 +26,6 @@ from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import caveat
 
-__all__ = ["summarise", "wavefronts"]
-
 _LIMITS = (0.5, 1.0, 1.5, 2.0)
 """Separations at which limits are stated, arcsec."""
 

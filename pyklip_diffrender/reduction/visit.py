@@ -54,14 +54,6 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = [
-    "Contribution",
-    "Visit",
-    "rough_settings",
-    "with_references",
-    "worth_joining",
-]
-
 _log = logging.getLogger(__name__)
 
 _SLEWS = WavefrontPrior(scales={"segment": 0.75, "texture": 0.5}, knee=1.0, slope=1.0)

@@ -49,15 +49,6 @@ from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate
 
-__all__ = [
-    "NOTHING",
-    "Annealing",
-    "Course",
-    "conclude",
-    "derivatives_of",
-]
-
-
 # The course of a fit: its states, and how far it has come.
 
 _ROUNDS = 6

@@ -32,20 +32,6 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = [
-    "decoded",
-    "encoded",
-    "image",
-    "linear_hdus",
-    "linear_of",
-    "model_facts",
-    "model_of",
-    "observation_hdus",
-    "observation_of",
-    "reading",
-    "text_hdu",
-]
-
 _DATACLASSES = {each.__name__: each for each in (GaussNewton, WavefrontPrior, Planet)}
 _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 

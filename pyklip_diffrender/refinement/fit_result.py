@@ -50,17 +50,7 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import ccd_data, primary_hdu, world_coordinates
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import Basis
-from pyklip_diffrender.wavefront.opd import OPDMap
-
-__all__ = [
-    "WHAT_TO_CHECK",
-    "FrameFit",
-    "Refinement",
-    "Status",
-    "breakdown_explained",
-    "parameter_table",
-]
-
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # How a refinement ended, and the error of one whose linear algebra breaks down.
 

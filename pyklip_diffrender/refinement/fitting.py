@@ -36,22 +36,6 @@ from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import as_opd_map
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = [
-    "align_frame",
-    "continue_from",
-    "fit_in_stages",
-    "jansky_per_unit",
-    "join_frames",
-    "refine",
-    "refine_again",
-    "require_agreement_of_flux",
-    "require_calibrated",
-    "star_flux_error",
-    "to_jansky",
-    "with_star_flux",
-]
-
-
 # Fits that continue earlier ones, with more modes or other settings.
 
 _log = logging.getLogger(__name__)

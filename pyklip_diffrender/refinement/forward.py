@@ -27,28 +27,14 @@ from pyklip_diffrender.linear.response import (
     coarse_copy,
     downsample,
 )
-from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 from pyklip_diffrender.scene.exposure import flat_field_of, module_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
-from pyklip_diffrender.wavefront.opd import OPDMap, resample
-
-__all__ = [
-    "ACCURATE",
-    "Forward",
-    "FrameDerivatives",
-    "Objective",
-    "Point",
-    "Problem",
-    "State",
-    "allowance",
-    "pixel_grid",
-    "starting_values",
-]
-
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # A frame to be fitted: data, noise, and the forward model in the data's unit.
 

@@ -16,8 +16,6 @@ from pyklip_diffrender.linear.model import LinearModel, TemplateProducts
 from pyklip_diffrender.refinement.forward import Objective, State, pixel_grid
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["INNER", "bright_companions", "isolated_outliers", "local_maxima", "with_dominant"]
-
 
 def local_maxima(
     image: NDArray[np.float64], allowed: NDArray[np.bool_], threshold: float, *, size: int

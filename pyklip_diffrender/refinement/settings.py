@@ -24,19 +24,6 @@ from pyklip_diffrender.scene.simulation import pupil_samples
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, WavefrontPrior, scale_ratios
 
-__all__ = [
-    "OWN_PARAMETERS",
-    "GaussNewton",
-    "ModePriors",
-    "coarse_arguments",
-    "count_modes_below",
-    "exposure_sequences",
-    "faintness",
-    "nircam_settings",
-    "quick_settings",
-    "settings_for",
-]
-
 _REACH = 40
 """Pixels from the star to the edge of the square that `reduce` fits."""
 

@@ -42,20 +42,6 @@ from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_evidence
 
-__all__ = [
-    "EquationsCache",
-    "ModelDerivatives",
-    "NormalEquations",
-    "Solver",
-    "Step",
-    "StepState",
-    "accurate_step",
-    "conjugate_gradients",
-    "first_unknowns",
-    "linearise",
-]
-
-
 # The unknowns of a fit, and the values from which they start.
 
 _PEDESTAL = 0.5

@@ -22,13 +22,6 @@ from pyklip_diffrender.linear.model import FrameRows, Unknown
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = [
-    "COMPANION_PRIOR",
-    "FrameUnknowns",
-    "Unknowns",
-    "brightest",
-]
-
 _LINEAR = tuple(p.name for p in LEVELS)
 
 _BRIGHT = 1e-4

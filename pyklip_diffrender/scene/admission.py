@@ -25,25 +25,6 @@ from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = [
-    "EPOCH",
-    "FrameFile",
-    "admissible",
-    "choose_filter",
-    "choose_target",
-    "epochs_of",
-    "exclude_other_setups",
-    "exclude_unoriented",
-    "exclude_unusable",
-    "exposures_in",
-    "frames_by_star",
-    "reasons_of",
-    "require_agreement",
-    "require_some",
-    "with_references",
-]
-
-
 # Files of frames, and which of them cannot be used or are there twice.
 
 _SENSED = "RESULT_PHASE"

@@ -18,8 +18,6 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.io.files import fits_files, read_text
 
-__all__ = ["ListedFile", "Role", "listed_files", "matches"]
-
 _log = logging.getLogger(__name__)
 
 Role = Literal["science", "psf"]

@@ -30,27 +30,6 @@ from pyklip_diffrender.io.headers import (
 )
 from pyklip_diffrender.io.units import full_circle, half_circle
 
-__all__ = [
-    "CatalogueStar",
-    "Exposure",
-    "bar_place",
-    "beginning",
-    "common_motion",
-    "detector_of",
-    "flat_field_of",
-    "identity_of",
-    "image_mask",
-    "instrument_of",
-    "is_reference",
-    "level_of",
-    "middle",
-    "module_of",
-    "position_angle",
-    "proper_motion",
-    "star_of",
-]
-
-
 # The names of files in the archive: the product, the exposure, and the detector.
 
 _LEVEL = re.compile(r"_([a-z0-9]+)\.fits(\.gz)?$", re.IGNORECASE)

@@ -33,25 +33,6 @@ from pyklip_diffrender.io.units import (
     to_unit,
 )
 
-__all__ = [
-    "Judgement",
-    "calibrated_errors",
-    "checked_frames",
-    "checked_stacks",
-    "compressed",
-    "dark_pixels",
-    "empty_integrations",
-    "judge_integrations",
-    "judge_pointings",
-    "mask_unusable",
-    "pointings",
-    "selected",
-    "usable_pixels",
-    "weighted_mean",
-    "why_odd_noise",
-]
-
-
 # Checks of the arrays and numbers that an observation is made of.
 
 

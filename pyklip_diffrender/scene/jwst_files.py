@@ -43,28 +43,6 @@ from pyklip_diffrender.scene.integrations import (
 )
 from pyklip_diffrender.scene.star_place import measured_offset
 
-__all__ = [
-    "BAD_PIXEL_BITS",
-    "BEHIND_THE_MASK",
-    "SHIFTS",
-    "dither",
-    "filled",
-    "first_pixel",
-    "mask_place",
-    "net_shifts",
-    "on_detector",
-    "on_detector_pixels",
-    "read_calints",
-    "recorded_shifts",
-    "shift_frames",
-    "shift_variances",
-    "single_precision",
-    "undo_shifts",
-    "unflagged",
-    "without_empty",
-]
-
-
 # Undo the shifts of aligned frames, so that their pixels are those of the detector.
 #
 # A flat-field error belongs to a pixel of the detector. spaceKLIP's alignment moves frames by

@@ -21,16 +21,6 @@ from pyklip_diffrender.io.units import (
     to_pair,
 )
 
-__all__ = [
-    "ALPHA_PICTORIS_W2",
-    "BETA_PICTORIS_W2",
-    "PAPER_SEGMENT_GAP",
-    "UNOCCULTED_PEAK",
-    "Planet",
-    "Scene",
-    "Star",
-]
-
 BETA_PICTORIS_W2 = 3.182
 """WISE W2 magnitude (4.6 um) of the paper's target."""
 

@@ -32,16 +32,6 @@ from pyklip_diffrender.scene.integrations import (
 )
 from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
 
-__all__ = [
-    "Observation",
-    "Window",
-    "frames_in",
-    "frames_of_file",
-    "means_of_file",
-    "means_of_pointings",
-]
-
-
 # Boxes of pixels about the star: cutting them out of frames and putting them back.
 
 

@@ -21,19 +21,6 @@ from pyklip_diffrender.scene.integrations import dark_pixels
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symmetry, stamp_about
 
-__all__ = [
-    "brightness",
-    "copies",
-    "exclude_contradicting",
-    "exclude_copies",
-    "not_judged",
-    "why_few_pixels",
-    "why_no_star",
-    "why_odd_unit",
-    "why_other_brightness",
-    "why_turned",
-]
-
 Image = NDArray[np.float64]
 
 _CORE = 1.0

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from pyklip_diffrender.io.headers import fits_text, known_number, known_text, set_keyword
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["ccd_data", "primary_hdu", "world_coordinates"]
-
 _OBSERVED = (
     "TELESCOP", "INSTRUME", "DETECTOR", "CHANNEL", "FILTER", "PUPIL", "CORONMSK", "SUBARRAY",
     "APERNAME", "EXP_TYPE", "PROGRAM", "TARGPROP", "TARGNAME", "TARG_RA", "TARG_DEC", "DATE-BEG",

@@ -46,9 +46,6 @@ from pyklip_diffrender.scene.pixel_checks import (
 )
 from pyklip_diffrender.scene.simulation import images_of_stars
 
-__all__ = ["SHORT", "Epoch", "Row", "Sequence", "epochs_of_files", "judge_frames", "rows_table"]
-
-
 # The table of admission: one row for each file, what it is used for, and what it is.
 
 OF_ANOTHER_EPOCH = "of another epoch than the target, whose wavefront is another one"

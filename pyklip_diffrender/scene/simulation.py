@@ -29,20 +29,6 @@ from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.wavefront.opd import random_opd
 
-__all__ = [
-    "expected_photons",
-    "field_of",
-    "images_of_stars",
-    "model_for",
-    "planet_photons",
-    "pupil_samples",
-    "require_imaged",
-    "simulate",
-    "star_photons",
-    "within_field",
-]
-
-
 # The model for a real frame.
 
 Items = tuple[tuple[str, Any], ...]

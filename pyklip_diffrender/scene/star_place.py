@@ -6,14 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-__all__ = [
-    "center_of_pattern",
-    "center_of_symmetry",
-    "measured_offset",
-    "stamp_about",
-    "without_gaps",
-]
-
 Image = NDArray[np.float64]
 
 _FIELD = 2.5

@@ -25,18 +25,6 @@ from pyklip_diffrender.scene.exposure import (
 )
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = [
-    "HALF_COVERED",
-    "Systematics",
-    "caveat",
-    "contradiction",
-    "pattern_fields",
-    "pattern_hdus",
-    "require_pattern_of",
-    "shows_star",
-    "unrecorded",
-]
-
 _PROVENANCE = ("stars", "frames", "dates")
 
 

@@ -19,17 +19,6 @@ from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.headers import fits_text, known_number
 from pyklip_diffrender.pyklip_backend.output_files import on_product
 
-__all__ = [
-    "complete_header",
-    "source_table",
-    "write_contrast",
-    "write_database",
-    "write_mask",
-    "write_rolls",
-    "write_snr",
-]
-
-
 # Candidates in the form of spaceKLIP's table of sources.
 
 _OTHER_FLUXES = ("FLUX_SI", "FLUX_SI_ERR", "FLUX_SI_ALT", "FLUX_SI_ALT_ERR")

@@ -41,8 +41,6 @@ from pyklip_diffrender.spaceklip.database_files import (
     write_snr,
 )
 
-__all__ = ["Database", "run_obs"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -17,8 +17,6 @@ from pyklip_diffrender.options import OPTIONS, Option, SharedOptions
 from pyklip_diffrender.scene.associations import matches
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
-__all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
-
 _PIXEL = 0.063
 """arcsec; for the largest separation of an injected planet."""
 

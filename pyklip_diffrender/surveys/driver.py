@@ -30,8 +30,6 @@ from pyklip_diffrender.surveys.jobs import (
 from pyklip_diffrender.surveys.stars import StarSearch, search_stars
 from pyklip_diffrender.surveys.survey_page import row, table_of, write_tables
 
-__all__ = ["run_survey", "survey"]
-
 _log = logging.getLogger(__name__)
 
 _OF_WORKER = 0.8

@@ -46,9 +46,6 @@ from pyklip_diffrender.surveys.jobs import (
     write_record,
 )
 
-__all__ = ["Work", "failure", "in_this_process", "reduce_job", "run_job", "with_dask"]
-
-
 # The work of a job: a reduction, perhaps with an injected planet.
 
 

@@ -26,26 +26,6 @@ from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
 from pyklip_diffrender.wavefront.opd import wavefront_for
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
-__all__ = [
-    "RECORD",
-    "Injection",
-    "Job",
-    "clean",
-    "encodable",
-    "finished",
-    "folder_of",
-    "hash_of",
-    "jobs_of",
-    "prepare",
-    "publish",
-    "read_record",
-    "rename_to_jobs",
-    "staged",
-    "staging",
-    "write_record",
-]
-
-
 _DIGITS = 12
 """Digits of the key at the end of the name of a folder."""
 

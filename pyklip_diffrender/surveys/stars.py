@@ -26,8 +26,6 @@ from pyklip_diffrender.reduction import (
 )
 from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staged
 
-__all__ = ["FOLDER", "StarSearch", "search_stars"]
-
 FOLDER = "combined"
 """Folder of the searches of stars, in that of the survey."""
 

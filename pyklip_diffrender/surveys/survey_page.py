@@ -20,9 +20,6 @@ from pyklip_diffrender.reduction.pages import Picture, count, render
 from pyklip_diffrender.surveys.jobs import Job, Record
 from pyklip_diffrender.surveys.stars import StarSearch
 
-__all__ = ["COLUMNS", "page", "row", "table_of", "write_tables"]
-
-
 # The table of results: one row for each job.
 
 _AT = (0.5, 1.0, 1.5, 2.0)

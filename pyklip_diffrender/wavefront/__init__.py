@@ -11,7 +11,6 @@ from pyklip_diffrender.wavefront.bases import (
 )
 from pyklip_diffrender.wavefront.opd import (
     RULES,
-    OPDMap,
     as_opd_map,
     choose_map,
     random_drift,
@@ -19,6 +18,7 @@ from pyklip_diffrender.wavefront.opd import (
     read_opd,
     wavefront_for,
 )
+from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior, solve_with_evidence
 from pyklip_diffrender.wavefront.wss import interpolate_wss
 

@@ -21,8 +21,6 @@ from pyklip_diffrender.instrument.jwst import TABULATED_GAP, is_jwst_pupil, jwst
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
 from pyklip_diffrender.optics.planes import EntrancePupil
 
-__all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "default_basis", "fourier_part"]
-
 
 class Basis(Protocol):
     """A set of OPD modes."""

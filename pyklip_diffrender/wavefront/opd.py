@@ -45,21 +45,6 @@ from pyklip_diffrender.wavefront.wss import (
     why_not_sensed_well,
 )
 
-__all__ = [
-    "RULES",
-    "OPDMap",
-    "Rule",
-    "as_opd_map",
-    "choose_map",
-    "dated_maps",
-    "random_drift",
-    "random_opd",
-    "read_opd",
-    "resample",
-    "wavefront_for",
-]
-
-
 _MAP_NAMES = ("OPD", "OPDMAP", "WFE", "WAVEFRONT")
 """Names of extensions that hold a wavefront, whatever else is in the file."""
 

@@ -17,9 +17,6 @@ from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.units import require_finite, to_metres
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
 
-__all__ = ["FLAT", "OPDMap", "check_opd", "opd_to_hdus"]
-
-
 FLAT = "flat"
 """Word for a flat wavefront in place of a map."""
 

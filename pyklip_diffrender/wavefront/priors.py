@@ -23,15 +23,6 @@ from pyklip_diffrender.io.units import set_numbers, to_metres, to_number
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import Basis
 
-__all__ = [
-    "EvidenceUpdate",
-    "WavefrontPrior",
-    "learn_prior",
-    "scale_ratios",
-    "solve_with_evidence",
-]
-
-
 _ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
 

@@ -35,21 +35,6 @@ from pyklip_diffrender.io.headers import header_text, sensing_date
 from pyklip_diffrender.io.units import native_float64, require_shape
 from pyklip_diffrender.wavefront.opd_map import OPDMap, check_opd
 
-__all__ = [
-    "EXTENSION",
-    "TO_METRES",
-    "analysis_of",
-    "finest_pupil",
-    "interpolate_wss",
-    "load_wss_opd",
-    "load_wss_opd_by_date",
-    "pupil_samples",
-    "sensing_terms",
-    "stpsf_module",
-    "why_not_sensed_well",
-]
-
-
 # The aberrations that a wavefront-sensing map contains besides the telescope's, by stpsf's models.
 #
 # stpsf and its data (``STPSF_PATH``) are optional, and imported when they are first used.
