@@ -1,6 +1,7 @@
 """The gates for numbers and files: units, byte order, broken files, keywords, whole products."""
 
 import gzip
+import json
 import math
 import os
 import re
@@ -13,10 +14,12 @@ import pytest
 import torch
 from astropy import units as u
 from astropy.io import fits
+from astropy.table import QTable
 
 from pyklip_diffrender import io
 from pyklip_diffrender.errors import CorruptFileError, NonFiniteError
 from pyklip_diffrender.io.headers import KEYWORDS, fits_unit, set_keyword
+from pyklip_diffrender.io.tables import add_columns, plain_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -243,3 +246,24 @@ def test_values_are_such_as_headers_can_hold():
 def test_units_are_spelled_as_the_pipeline_does(unit, text):
     assert fits_unit(u.Unit(unit)) == text
     assert u.Unit(text) == u.Unit(unit)
+
+
+def test_columns_say_what_they_are_and_rows_are_json():
+    columns = [
+        ("place", np.array([0.5, np.inf]), u.arcsec, ".2f", "from the star"),
+        ("light", np.array([12.0, np.nan]), u.mag, "", ""),
+        ("count", np.array([3, 4]), None, "", ""),
+        ("seen", np.array([True, False]), None, "", ""),
+        ("name", np.array(["a", ""]), None, "", "of the source"),
+    ]
+    table = add_columns(QTable(meta={"sigmas": 5}), columns)
+    assert (table.meta, table["place"].unit) == ({"sigmas": 5}, u.arcsec)
+    place = table["place"].info
+    assert (place.format, place.description) == (".2f", "from the star")
+    assert (table["light"].info.format, table["light"].info.description) == (None, None)
+    rows = plain_rows(table)
+    # Numbers of numpy are no JSON, and NaN and infinity are not either.
+    assert json.loads(json.dumps(rows, allow_nan=False)) == [
+        {"place_arcsec": 0.5, "light": 12.0, "count": 3, "seen": True, "name": "a"},
+        {"place_arcsec": None, "light": None, "count": 4, "seen": False, "name": ""},
+    ]
