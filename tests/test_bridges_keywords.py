@@ -150,9 +150,7 @@ def test_keywords_of_poppy_act_as_there(poppy_system, keyword):
 
 
 STPSF_CASES = [
-    name
-    if name in ("display", "outfile", "normalize")
-    else pytest.param(name, marks=pytest.mark.slow)
+    name if name in ("display", "normalize") else pytest.param(name, marks=pytest.mark.slow)
     for name in STPSF
 ]
 
