@@ -25,6 +25,7 @@ from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
 sys.path.append(str(Path(__file__).parents[2] / "examples" / "paper"))
+from coarse import coarse_steps as coarse_steps
 
 Array = NDArray[np.float64]
 
