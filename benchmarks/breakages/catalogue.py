@@ -291,12 +291,19 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "own-pattern", "the target's own frames are not in its pattern",
-            """
-            and not (pattern.catalogue.is_same(star) or same_name(pattern.star, observation.target))
-            and not any(same_name(pattern.star, each) for each in star.names)
-            """, """
-            """,
+            "            and not shows_star(pattern, observation)\n", "",
             "learn",
+        ),
+        Breakage(
+            "other-sources", "the light of other sources is left in the maps of an epoch",
+            "self.residuals[name].without(light)", "self.residuals[name]",
+            "combined_search",
+        ),
+        Breakage(
+            "place-of-significance", "a source is where it is most significant",
+            "lambda place: family.snr(self.stack(search, place, move, maps), spectrum),",
+            "lambda place: float(family.statistic(self.stack(search, place, move, maps))),",
+            "combined_search",
         ),
         Breakage(
             "pattern-size", "the size of a pattern is 1 where frames show it",
