@@ -551,6 +551,32 @@ def test_probabilities_are_frequencies(epochs, filters, count):
 
 
 @pytest.mark.slow
+def test_a_crowded_field_has_no_wrong_verdict():
+    """Twenty-five sources, orbits of 0.3 arcsec: more associations than can be compared."""
+    rng = np.random.default_rng(0)
+    places, heights = rng.uniform(-2, 2, (25, 2)), np.exp(rng.uniform(*np.log([6, 60]), 25))
+    bound = rng.random(25) < 0.3
+    proper = np.array([0.05, -0.08])
+    reductions = [
+        found(
+            "F444W", k, mjd=59900 + 3 * YEAR * k, side=81, north=30.0 * k,
+            sources=[(*(place - 3 * k * proper * (not own)), height)
+                     for place, own, height in zip(places, bound, heights, strict=True)],
+        )
+        for k in range(2)
+    ]  # fmt: skip
+    table = dr.combine(reductions, proper_motion=proper, parallax=0.1).candidates
+    assert len(table) == 25
+    for row in table:
+        start = np.array([row["delta_ra"].value, row["delta_dec"].value])
+        start = start + (row["epoch_mjd"] - 59900) / YEAR * proper * np.array([[0.0], [1.0]])
+        away = np.hypot(*(places[None] - start[:, None]).transpose(2, 0, 1))
+        source = int(np.argmin(away[[0, 1], :].min(axis=0)))
+        allowed = {BOUND if bound[source] else BACKGROUND, "not decided"}
+        assert row["verdict"] in allowed
+
+
+@pytest.mark.slow
 def test_orbits_allow_a_bound_source_to_move():
     """At 0.7 arcsec and 10 pc a circular orbit moves by 0.24 arcsec a year."""
     start = np.array([0.5, 0.45])

@@ -267,6 +267,7 @@ class Association:
         self._years = (np.array(dates) - dates[0]) / YEAR_DAYS
         self._background = np.array([motion.background(dates[0], date) for date in dates])
         self._known: dict[Track, Image] = {}
+        self._evidence: dict[Track, float] = {}
 
     def sources(self) -> list[Source]:
         """Sightings by source in the most probable association, with its hypotheses."""
@@ -294,25 +295,30 @@ class Association:
     def _of_group(self, members: list[int], linked: NDArray[np.bool_]) -> Iterator[Source]:
         """Sources among sightings of which no other can be a part."""
         members = sorted(members, key=lambda k: self._sightings[k].epoch)
-        kept: list[tuple[Track, ...]] = [()]
+        # Each with the logarithm of its probability, as far as the sightings decide.
+        kept: list[tuple[float, tuple[Track, ...]]] = [(0.0, ())]
         for k in members:
             epoch = self._sightings[k].epoch
             longer = [
-                (*tracks[:n], (*track, k), *tracks[n + 1 :])
-                for tracks in kept
+                (
+                    total - self._ln_seen(track) + self._ln_seen((*track, k)),
+                    (*tracks[:n], (*track, k), *tracks[n + 1 :]),
+                )
+                for total, tracks in kept
                 for n, track in enumerate(tracks)
                 if self._sightings[track[-1]].epoch < epoch and linked[k, list(track)].any()
             ]
-            kept = [*((*tracks, (k,)) for tracks in kept), *longer]
+            alone = self._ln_seen((k,))
+            kept = [*((total + alone, (*tracks, (k,))) for total, tracks in kept), *longer]
             if len(kept) > _MOST_ASSOCIATIONS:
-                kept.sort(key=lambda each: -sum(logsumexp(self._seen(t)) for t in each))
-                kept = kept[:_MOST_ASSOCIATIONS]
-        weights = np.array([sum(logsumexp(self._logs(t)) for t in each) for each in kept])
-        weights = np.exp(weights - weights.max())
-        for track in kept[int(np.argmax(weights))]:
+                kept = sorted(kept, key=lambda each: -each[0])[:_MOST_ASSOCIATIONS]
+        associations = [tracks for _, tracks in kept]
+        totals = np.array([sum(logsumexp(self._logs(t)) for t in each) for each in associations])
+        weights = np.exp(totals - totals.max())
+        for track in associations[int(np.argmax(weights))]:
             brightest = max(track, key=lambda k: self._sightings[k].snr)
             total = np.zeros(len(_KINDS))
-            for tracks, weight in zip(kept, weights, strict=True):
+            for tracks, weight in zip(associations, weights, strict=True):
                 logs = self._logs(next(each for each in tracks if brightest in each))
                 total += weight * np.exp(logs - logsumexp(logs))
             bound, background, neither = (total / total.sum()).tolist()
@@ -332,6 +338,12 @@ class Association:
                     logs[kind] += self._unseen(epoch, place, covariance, fluxes, frozenset(track))
             self._known[track] = logs
         return self._known[track].copy()
+
+    def _ln_seen(self, track: Track) -> float:
+        """Logarithm of the part of the evidence of a source that comes from its sightings."""
+        if track not in self._evidence:
+            self._evidence[track] = float(logsumexp(self._seen(track)))
+        return self._evidence[track]
 
     def _seen(self, track: Track) -> Image:
         """The logarithms, (3,), of the part of the evidence that comes from the sightings."""
