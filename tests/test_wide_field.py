@@ -205,6 +205,7 @@ def test_a_first_look_behind_a_bar_has_samples_for_all_of_it(filter):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux says the peak of a process, in kB.")
 def test_a_frame_of_the_whole_detector_takes_less_than_two_gigabytes(tmp_path):
     """In a process of its own, whose peak the operating system knows; 1.4 GB for two full rolls."""
     script = tmp_path / "whole_detector.py"
@@ -217,13 +218,10 @@ def test_a_frame_of_the_whole_detector_takes_less_than_two_gigabytes(tmp_path):
     assert run.returncode == 0, run.stderr
     *found, peak = map(float, run.stdout.split())
     assert found == pytest.approx([1e-4, -4.2, 5.1], rel=0.1)
-    # Linux counts in kB, macOS in bytes.
-    assert peak / (1e9 if sys.platform == "darwin" else 1e6) < 2
+    assert peak < 2e6
 
 
 WHOLE_DETECTOR = """
-import resource
-
 import numpy as np
 
 import pyklip_diffrender as dr
@@ -243,7 +241,8 @@ frame.data[0, 1660:1680, 1200:1220] = 1e6
 settings = dr.GaussNewton.nircam("F444W", cycles=(6.0,), max_iterations=4)
 result = dr.reduce(dr.Sequence("HD 1", (frame,)), opd, settings=settings, wide=True, size=40)
 row = result.wide.candidates[0]
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+# ru_maxrss would include the process of the tests, from which this one was made.
+peak = next(l.split()[1] for l in open("/proc/self/status") if l.startswith("VmHWM"))
 print(row["contrast"], row["x"].value, row["y"].value, peak)
 """
 
