@@ -20,7 +20,7 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Combination, Detection, combine
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.reduction.pages import Picture, plus_minus, render, scientific
+from pyklip_diffrender.reduction.pages import Picture, plus_minus, probability, render, scientific
 from pyklip_diffrender.scene.exposure import CatalogueStar, star_of
 
 SPECTRA = ("blackbody", "flat", "free")
@@ -234,9 +234,9 @@ def combined_rows(combined: Mapping[str, Any]) -> tuple[list[str], list[list[str
     """
     candidates = combined["candidates"]
     dated = any("verdict" in each for each in candidates)
-    title = ["", "Separation (arcsec)", "Position angle (deg)", "S/N", "Spectrum", "False alarm"]
-    title += [f"Contrast in {name}" for name in combined["filters"]]
-    title += ["Bound / background / neither (%)", "Verdict"] if dated else []
+    title = ["", "Separation (arcsec)", "Position angle (deg)", "S/N"]
+    title += ["Verdict", "Bound / background / neither (%)"] if dated else []
+    title += [*(f"Contrast in {name}" for name in combined["filters"]), "Spectrum", "False alarm"]
     rows = []
     for k, row in enumerate(candidates, 1):
         cells = [
@@ -244,19 +244,17 @@ def combined_rows(combined: Mapping[str, Any]) -> tuple[list[str], list[list[str
             plus_minus(row["separation_arcsec"], row["separation_error_arcsec"]),
             plus_minus(row["position_angle_deg"], row["position_angle_error_deg"]),
             f"{row['snr']:.1f}",
-            row["spectrum"],
-            scientific(row["false_alarm_probability"]),
         ]
+        if dated:
+            names = ("bound", "background", "neither")
+            shares = (f"{100 * row[f'probability_{name}']:.0f}" for name in names)
+            cells += [row["verdict"], " / ".join(shares)]
         for name in combined["filters"]:
             value, error = row[f"contrast_{name}"], row[f"contrast_error_{name}"]
             snr = row[f"snr_{name}"]
             known = None not in (value, error, snr)
             cells.append(f"{scientific(value, error)}, S/N {snr:.1f}" if known else "not observed")
-        if dated:
-            names = ("bound", "background", "neither")
-            shares = (f"{100 * row[f'probability_{name}']:.0f}" for name in names)
-            cells += [" / ".join(shares), row["verdict"]]
-        rows.append(cells)
+        rows.append([*cells, row["spectrum"], probability(row["false_alarm_probability"])])
     return title, rows
 
 
@@ -274,7 +272,7 @@ def in_words(combination: Combination | str) -> str:
         lines.append(
             f"  {row['separation'].value:.3f} arcsec at {row['position_angle'].value:.1f} deg, "
             f"S/N {row['snr']:.1f} ({row['spectrum']}), false-alarm probability "
-            f"{row['false_alarm_probability']:.1e}{verdict}"
+            f"{probability(row['false_alarm_probability'])}{verdict}"
         )
     lines += [f"  left out: {name}: {reason}" for name, reason in combination.left_out]
     return "\n".join([*lines, *(f"  {each}" for each in combination.remarks)])
