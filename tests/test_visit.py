@@ -282,24 +282,26 @@ TEACHING, TOGETHER = "reference star HD 2", "reference stars and target together
 
 
 @pytest.mark.parametrize(
-    ("near", "far", "options", "planned"),
+    ("near", "far", "options", "planned", "alone"),
     [
-        (3, 0, {}, [TOGETHER]),
-        (1, 0, {}, [TOGETHER]),
+        (3, 0, {}, [TOGETHER], 0),
+        (1, 0, {}, [TOGETHER], 0),
         # Where the pattern is known, one frame of a star is not worth the time.
-        (1, 2, {}, [TEACHING]),
-        (3, 2, {}, [TEACHING, TOGETHER]),
-        (0, 2, {"references": "off"}, []),
-        (0, 2, {"systematics": "off"}, []),
-        (1, 1, {"references": "pattern"}, [TEACHING]),
+        (1, 2, {}, [TEACHING], 1),
+        (3, 2, {}, [TEACHING, TOGETHER], 0),
+        (0, 2, {"references": "off"}, [], 2),
+        (0, 2, {"systematics": "off"}, [], 2),
+        (1, 1, {"references": "pattern"}, [TEACHING], 0),
     ],
 )
-def test_a_plan_has_what_reference_frames_are_used_for(near, far, options, planned):
+def test_a_plan_has_what_reference_frames_are_used_for(near, far, options, planned, alone):
     references = (*(reference(k) for k in range(near)), *(later(k) for k in range(far)))
     sequence = dr.Sequence("HD 1", science(), references)
     steps = describe_steps(sequence, ReduceOptions(size=SIZE, **options)).splitlines()
     names = [each.partition(". ")[2] for each in steps]
     assert [name for name in names if name in (TEACHING, TOGETHER)] == planned
+    only = f", with {alone} reference frame{'' if alone == 1 else 's'} for KLIP only"
+    assert names[-1] == f"products{only if alone else ''}"
 
 
 FLAT_FIELD = "jwst_nircam_flat_0001.fits"

@@ -194,15 +194,16 @@ def describe_steps(sequence: Sequence, options: ReduceOptions) -> str:
         frames(sequence, options) for frames in (frames_for_pattern, frames_in_likelihood)
     )
     steps = []
+    if known or not (searched or systematics == "references"):
+        teaching = ()
     if known:
         unplaced = [each.name for each in sequence.science if each.first_pixel is None]
         steps += [f"place of {name} on the detector" for name in unplaced]
-    elif searched or systematics == "references":
-        stars = dict.fromkeys(each.target for each in teaching)
-        steps += [f"reference star {star}" for star in stars]
+    steps += [f"reference star {star}" for star in dict.fromkeys(e.target for e in teaching)]
     steps.append("wavefront")
-    is_known = known or (searched and bool(teaching))
-    if worth_joining(joining) if is_known else joining:
+    if known or (searched and bool(teaching)):
+        joining = tuple(worth_joining(joining))
+    if joining:
         steps.append("reference stars and target together")
     steps.append("search")
     if options.disk:
@@ -213,7 +214,10 @@ def describe_steps(sequence: Sequence, options: ReduceOptions) -> str:
         steps.append(f"{options.injections} injected planets")
     if options.completeness:
         steps.append("completeness")
-    steps.append("products")
+    used = [*teaching, *joining]
+    unused = sum(not any(each is one for one in used) for each in sequence.references)
+    only = f", with {unused} reference frame{'' if unused == 1 else 's'} for KLIP only"
+    steps.append(f"products{only if unused else ''}")
     return "\n".join(f"{number}. {step}" for number, step in enumerate(steps, 1))
 
 
