@@ -202,6 +202,7 @@ def test_what_does_not_go_together_is_refused_before_the_work(
         raise Begun
 
     monkeypatch.setattr(fitting, "fit_in_stages", fit_in_stages)
+    # Doors wrap the error in their own; which it is, and its words, are asserted below.
     with pytest.raises(Exception) as caught:  # noqa: PT011
         through_its_door(case, world, tmp_path)
     assert tuple(begun) == refusal.goes_on

@@ -649,5 +649,6 @@ def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, m
     try:
         said = getattr(faults, scenario)(tmp_path, 1, 60)
     except PermissionError as error:
+        # The scenario mounts a small disk or lowers limits, which needs rights that not all have.
         pytest.skip(f"{scenario}: {error}")
     assert said

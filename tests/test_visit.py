@@ -453,7 +453,11 @@ def test_exposure_sequences():
 
 def test_the_size_of_the_drift_is_that_of_the_frames(monkeypatch):
     steps, measure = [], Annealing._measure_priors
-    recorded = lambda self, course: (steps.append(len(self.history)), measure(self, course))  # noqa: E731
+
+    def recorded(self, course):
+        steps.append(len(self.history))
+        measure(self, course)
+
     monkeypatch.setattr(Annealing, "_measure_priors", recorded)
     stated = WavefrontPrior({"segment": 0.6, "texture": 0.3}, knee=1.0)
     settings = replace(SETTINGS, drift=stated, dither_drift=stated, drift_cycles=6.0)
