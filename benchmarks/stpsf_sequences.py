@@ -3,7 +3,7 @@
 Run from the root of the project, with stpsf installed and its data named by STPSF_PATH::
 
     STPSF_PATH=... python -m benchmarks.stpsf_sequences --output FOLDER [--cases NAME ...]
-        [--repeat N] [--size PIXELS]
+        [--repeat N] [--size PIXELS] [--age DAYS] [--flux FLUX] [--accuracy quick]
 
 Each case has two rolls of a star with two planets, as calints files with the headers of MAST. The
 images are stpsf's, with its internal wavefront errors, jitter, distortion, charge diffusion and
@@ -12,7 +12,8 @@ and from roll to roll; the star is a few milliarcseconds from the middle of the 
 has an error of 2 % in every pixel, which nobody tells the reduction; pixels are bad, some of them
 without a flag; and there are photon and read noise. With ``--references`` a second, brighter star
 was observed at small dithers. Other numbers of ``--repeat`` have other wavefronts, flat fields,
-bad pixels and noise, and ``--size`` is the side of the fitted square.
+bad pixels and noise, and ``--size`` is the side of the fitted square. With ``--age`` the map is so
+many days old, and the wavefront has drifted accordingly.
 
 Prints a row for each case: planets that were found and missed, false candidates, pulls of flux and
 position, scatter of the S/N without the candidates, limits over those for a known star beyond 0.5
@@ -37,6 +38,7 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
+from astropy.time import Time
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 import pyklip_diffrender as dr
@@ -85,6 +87,10 @@ class Case:
     flux: float = 3e7
     size: int = 80
     """Side of the fitted square, pixels."""
+    age: float | None = None
+    """Days from the map to the frames, in which the wavefront drifts like a random walk, by 9 nm
+    rms in 3.6 days (Feng et al. 2025, section 4); None: two days, in which it drifts by `DRIFT`."""
+    accuracy: str = "full"
 
     @property
     def name(self) -> str:
@@ -94,6 +100,17 @@ class Case:
     def side(self) -> int:
         """Side of the frames, pixels."""
         return self.size + 2 * MARGIN
+
+    @property
+    def drift(self) -> float:
+        """Rms of the wavefront's change since the map, m."""
+        return DRIFT if self.age is None else 9e-9 * float(np.sqrt(self.age / 3.6))
+
+    @property
+    def map_name(self) -> str:
+        """Name of the file of the map, with its date."""
+        date = Time("2022-10-03") - (2 if self.age is None else self.age) * u.day
+        return f"opd_{date.isot[:10]}.fits"
 
 
 def _planets(*places: tuple[float, float, float]) -> tuple[Planet, ...]:
@@ -190,9 +207,11 @@ def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0)
     """Write the frames of a case and the map of before; returns the map."""
     nircam = instrument_of(case)
     opd, header = map_of(nircam)
-    before = folder / "opd_2022-10-01.fits"
+    before = folder / case.map_name
     hdu = fits.PrimaryHDU(opd, header)
     hdu.header["BUNIT"] = "m"
+    if case.age is not None:
+        hdu.header["DATE-OBS"] = case.map_name[4:14]
     hdu.writeto(before, overwrite=True)
     # Of its own for every case: errors of planets at the same place are independent.
     rng = np.random.default_rng([*case.name.encode(), *([repeat] if repeat else [])])
@@ -201,7 +220,7 @@ def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0)
     flat = 1 + FLAT_ERROR * rng.normal(size=(side, side))
     flagged = rng.random((side, side)) < FLAGGED
     hot = rng.integers(side // 2 - 15, side // 2 + 15, (UNFLAGGED, 2))
-    changed = opd + _change(int(seeds[0]), DRIFT, opd)
+    changed = opd + _change(int(seeds[0]), case.drift, opd)
     for k, (roll, star) in enumerate(zip(ROLLS, STARS, strict=True), 1):
         now = changed + _change(int(seeds[k]), BETWEEN, opd)
         light = image(nircam, case, now, header, star, case.nlambda[0])
@@ -260,19 +279,20 @@ def _write(
 
 def reduced(case: Case, folder: Path, references: int = 0, repeat: int = 0) -> dict[str, Any]:
     """Make the frames of a case, reduce them with the defaults, and compare with the truth."""
-    done = folder / "result.json"
+    done = folder / ("result.json" if case.accuracy == "full" else f"{case.accuracy}.json")
     if done.is_file():
         result: dict[str, Any] = json.loads(done.read_text(encoding="utf-8"))
         return result
     folder.mkdir(parents=True, exist_ok=True)
     made = time.process_time()
-    before = folder / "opd_2022-10-01.fits"
+    before = folder / case.map_name
     if len(list((folder / "frames").glob("*.fits"))) < len(ROLLS) + references:
         before = write_frames(case, folder, references, repeat)
     made = time.process_time() - made
     sequence = Sequence.from_files(folder / "frames", target="HD 1")
     began = time.process_time()
-    reduction = dr.reduce(sequence, before, size=case.size)
+    size = case.size if case.accuracy == "full" else None
+    reduction = dr.reduce(sequence, before, size=size, accuracy=case.accuracy)
     seconds = time.process_time() - began
     result = (
         compare(case, reduction)
@@ -391,9 +411,9 @@ def pulls(results: list[dict[str, Any]]) -> str:
     return f"pulls of {len(planets)} planets, mean and rms: {'; '.join(words)}"
 
 
-def _run(name: str, size: int, folder: Path, references: int, repeat: int) -> dict[str, Any]:
+def _run(case: Case, folder: Path, references: int, repeat: int) -> dict[str, Any]:
     warnings.simplefilter("ignore")
-    return reduced(replace(CASES[name], size=size), folder, references, repeat)
+    return reduced(case, folder, references, repeat)
 
 
 def main() -> None:
@@ -404,6 +424,9 @@ def main() -> None:
     parser.add_argument("--references", type=int, default=0, choices=range(len(DITHERS) + 1))
     parser.add_argument("--repeat", type=int, default=0, choices=range(60))
     parser.add_argument("--size", type=int, default=Case.size)
+    parser.add_argument("--age", type=float, help="days from the map to the frames")
+    parser.add_argument("--flux", type=float, default=Case.flux, help="of the star")
+    parser.add_argument("--accuracy", default=Case.accuracy, choices=["full", "quick"])
     options = parser.parse_args()
     columns = ["case", "found", "false", "S/N", "flux / truth", "pull of flux", "of separation",
                "of angle", "away, mas", "S/N scatter", "limits / known star", "status", "CPU s",
@@ -412,11 +435,17 @@ def main() -> None:
     context = multiprocessing.get_context("spawn")
     for name in options.cases:
         again = f"_{options.repeat}" if options.repeat else ""
-        larger = f"_size{options.size}" if options.size != Case.size else ""
-        folder = options.output / f"{name.replace(' ', '_')}_{options.references}{again}{larger}"
+        changes = {key: getattr(options, key) for key in ("size", "age", "flux", "accuracy")}
+        case = replace(CASES[name], **changes)
+        other = "".join(
+            f"_{key}{changes[key]:g}"
+            for key in ("size", "age", "flux")
+            if changes[key] != getattr(Case, key)
+        )
+        folder = options.output / f"{name.replace(' ', '_')}_{options.references}{again}{other}"
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             try:
-                about = (name, options.size, folder, options.references, options.repeat)
+                about = (case, folder, options.references, options.repeat)
                 result = pool.submit(_run, *about).result()
             except Exception as error:
                 print(f"| {name} | {type(error).__name__}: {error} |", flush=True)

@@ -212,6 +212,19 @@ def test_a_bad_fit_is_left_out_and_its_candidates_with_it():
         dr.combine([bad, good[0]])
 
 
+def test_a_fit_with_scaled_errors_takes_part_and_is_named():
+    """Its noise is measured, so that the search is the same as that of a fit that converged."""
+    sources, wide = [(0.6, 0.3, 7.0)], {"freedom": 60.0, "factor": 1.5}
+    other = searched("F356W", 2, sources)
+    both = dr.combine([searched("F444W", 1, sources, status="PRIOR_MISMATCH", **wide), other])
+    usual = dr.combine([searched("F444W", 1, sources, **wide), other])
+    np.testing.assert_array_equal(both.snr, usual.snr)
+    assert len(both.candidates) == len(usual.candidates) == 1
+    assert not both.left_out
+    (remark,) = set(both.remarks) - set(usual.remarks)
+    assert "F444W 2023-02-25 (PRIOR_MISMATCH, errors multiplied by 1.50)" in remark
+
+
 def test_frames_count_once():
     """Two reductions of one frame, as with other options, are not two observations."""
     one = searched("F444W", 1, [(0.6, 0.3, 4.0)])

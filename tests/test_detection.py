@@ -28,6 +28,7 @@ from pyklip_diffrender.refinement import Status, refine_again
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.scene import Planet, world_coordinates
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.opd import as_opd_map
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 FLUX = 3e11
@@ -149,6 +150,34 @@ def test_a_prior_of_another_size_is_adapted(world, monkeypatch):
     assert refine_again(fit).scales == pytest.approx(fit.scales)
     with pytest.raises(AttributeError, match="_narrowed"):
         refine_again(kept, adapt_prior=True)
+
+
+def test_a_prior_that_is_far_too_narrow_reaches_its_size_at_once(world, caplog):
+    """The linear model tells how far; without it, a prior grew by a part of that in each fit."""
+    likely = world.fitted(4)
+    narrow = WavefrontPrior({n: scale / 8 for n, scale in likely.scales.items()}, fit_scales=False)
+    with caplog.at_level("INFO", logger="pyklip_diffrender"):
+        fit = world.refined(world.observed(world.expected(), 4), prior=narrow, adapt_prior=True)
+    assert fit.status is Status.CONVERGED
+    # A prior up to a quarter too wide is not narrowed.
+    assert 0.85 < fit.scales["segment"] / likely.scales["segment"] < 1.25
+    assert caplog.text.count("the wavefront is larger than its prior says") == 1
+
+
+def test_the_prior_on_the_segments_is_wider_for_an_older_map(world):
+    observation = replace(world.observed(world.expected(), 4), date=Time("2023-01-01"))
+    prior = WavefrontPrior({"segment": 1.0, "texture": 0.1}, fit_scales=False)
+
+    def start(days, **changes):
+        opd = replace(as_opd_map(world.opd), date=Time("2023-01-01") - days * u.day)
+        settings = dr.GaussNewton(basis=world.basis, prior=prior, max_iterations=1, **changes)
+        return dr.refine(world.model, observation, opd, settings=settings).settings.prior.scales
+
+    assert start(50, adapt_prior=True) == prior.scales
+    # As a random walk, from the 60 days on up to which the preset holds.
+    assert start(240, adapt_prior=True) == {"segment": pytest.approx(2.0), "texture": 0.1}
+    assert start(-240, adapt_prior=True)["segment"] == pytest.approx(2.0)
+    assert start(240) == prior.scales
 
 
 def test_the_prior_of_the_amplitude_is_widened_as_well(world):

@@ -40,7 +40,6 @@ from pyklip_diffrender.reduction import (
     write_comparison,
 )
 from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
-from pyklip_diffrender.reduction.visit import worth_joining
 from pyklip_diffrender.scene.sequence import SHORT, Sequence
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
@@ -201,8 +200,6 @@ def describe_steps(sequence: Sequence, options: ReduceOptions) -> str:
         steps += [f"place of {name} on the detector" for name in unplaced]
     steps += [f"reference star {star}" for star in dict.fromkeys(e.target for e in teaching)]
     steps.append("wavefront")
-    if known or (searched and bool(teaching)):
-        joining = tuple(worth_joining(joining))
     if joining:
         steps.append("reference stars and target together")
     steps.append("search")

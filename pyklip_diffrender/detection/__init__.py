@@ -17,6 +17,7 @@ from pyklip_diffrender.detection.candidates import (
 )
 from pyklip_diffrender.detection.combined_result import COMBINED, Combination
 from pyklip_diffrender.detection.combined_search import combine
+from pyklip_diffrender.detection.deeper import deeper, stated_limits
 from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.disk import Disk, fit_disk
 from pyklip_diffrender.detection.recovery import (
@@ -54,6 +55,7 @@ __all__ = [
     "combine_frames",
     "completeness",
     "contrast_of_completeness",
+    "deeper",
     "detect",
     "draw_curve",
     "fit_disk",
@@ -66,6 +68,7 @@ __all__ = [
     "sources_at_edges",
     "sources_beyond",
     "sources_of_references",
+    "stated_limits",
     "wide_field",
     "with_planets",
     "without_blurred_edges",

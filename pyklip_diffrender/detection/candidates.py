@@ -636,11 +636,12 @@ def count_rolls(fits: Sequence[Refinement]) -> int:
 def caveats(detection: Any) -> str:
     """Sources that only the fit of a `Detection` has, and what a single roll cannot tell."""
     fits = detection.fits
-    sources = unconfirmed_companions(fits, detection.sources) if fits else ()
+    sources = unconfirmed_companions(fits, detection.sources) if fits else np.zeros((0, 3))
     remarks = [
         f"A possible source of contrast {contrast:.1e} at {math.hypot(x, y):.2f} arcsec was "
         "fitted with the star; the search does not confirm it."
-        for contrast, x, y in sources
+        # A negative companion takes up an error of the model, and is no source.
+        for contrast, x, y in sources[sources[:, 0] > 0]
     ]
     if detection.rolls == 1 and detection.observation.is_nircam:
         step = np.rad2deg(detection.contrast_curve.meta["resolution_arcsec"])

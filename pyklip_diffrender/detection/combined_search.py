@@ -47,6 +47,7 @@ from pyklip_diffrender.scene.exposure import common_motion, star_of
 Spectra = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 _NOT_CALIBRATED = tuple(each.name for each in Status if not each.calibrated)
+"""Statuses of fits whose noise alone does not give the errors of a search."""
 
 
 def combine(
@@ -76,8 +77,9 @@ def combine(
     ----------
     reductions : sequence of Reduction, Detection or path
         A path is that of a folder with the products of a reduction, of which ``detection.fits`` is
-        read. Those whose fit does not explain its data are left out, as are those of frames that
-        another reduction has.
+        read. A fit that does not explain its data takes part if its errors were scaled to the
+        scatter of the S/N, as they are in real frames; `Combination.remarks` names it. A reduction
+        whose frames another one has is left out.
     spectra : str, path, or sequence of them
         "blackbody" (150 to 1,500 K), "flat" (the same flux density per frequency in all filters),
         the file of a table of spectra (see `planet_spectra`), and "free": any fluxes that are
@@ -179,8 +181,23 @@ def combine(
         grid=searcher.grid,
         snr=np.where(np.isfinite(stack.error).any(axis=0), snr, np.nan),
         motion=motion,
-        remarks=(*remarks, *searcher.remarks),
+        remarks=(*remarks, *_about_errors(detections, maps), *searcher.remarks),
     )
+
+
+def _about_errors(detections: Mapping[str, Detection], maps: Sequence[SkyMap]) -> list[str]:
+    """Which of the combined reductions have errors that rest on the scatter of their S/N alone."""
+    scaled = [
+        f"{each.name} ({status}, errors multiplied by {detections[each.name].scatter:.2f})"
+        for each in maps
+        if (status := str(detections[each.name].provenance["status"])) in _NOT_CALIBRATED
+    ]
+    if not scaled:
+        return []
+    return [
+        "Fits that did not converge to a model which explains their data take part with errors "
+        f"that are scaled to the scatter of the S/N: {'; '.join(scaled)}"
+    ]
 
 
 def _as_detection(reduction: Any) -> Detection:
@@ -233,8 +250,11 @@ def _usable(
         status = str(detection.provenance["status"])
         frames = _frames(detection)
         reason = ""
-        if status in _NOT_CALIBRATED:
-            reason = f"its fit does not explain its data ({status}), so that its errors are wrong"
+        if status in _NOT_CALIBRATED and not detection.error_factor.is_measured:
+            reason = (
+                f"its fit ended as {status}, and its errors are not scaled to the scatter of the "
+                "S/N, so that they are wrong"
+            )
         elif detection.sky.north is None:
             reason = "its frames have no position angle"
         elif detection.observation.filter is None:

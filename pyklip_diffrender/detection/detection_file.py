@@ -141,6 +141,9 @@ def write_astrometry(
 
 _WCS = re.compile(r"WCSAXES|RADESYS|(CTYPE|CUNIT|CRPIX|CRVAL)[12]|CD[12]_[12]")
 
+_OTHER = "detection_other.fits"
+"""File of the search that is deeper at some separations, beside detection.fits."""
+
 _MAPS = {
     "SNR": "snr",
     "RESIDUAL_SNR": "residual_snr",
@@ -203,6 +206,11 @@ def _hdus_of(detection: Any) -> fits.HDUList:
                 )
             ),
             image_hdu(np.asarray(detection.has_limits, dtype=float), "HAS_LIMITS", "", wcs),
+            *(
+                []
+                if detection.of_other is None
+                else [image_hdu(detection.of_other.astype(float), "OF_OTHER", "", wcs)]
+            ),
             image_hdu(detection.grid[..., 0], "OFFSET_X", "arcsec", wcs),
             image_hdu(detection.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
             *(
@@ -226,6 +234,8 @@ def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     maps["grid"] = np.stack([image(hdus, "OFFSET_X", 0), image(hdus, "OFFSET_Y", 0)], axis=-1)
     factors, freedom = image(hdus, "ERROR_FACTOR", 0), image(hdus, "FREEDOM", 0)
     maps["has_limits"] = image(hdus, "HAS_LIMITS", 0) > 0
+    if "OF_OTHER" in hdus:
+        maps["of_other"] = image(hdus, "OF_OTHER", 0) > 0
     shapes = {each.shape[:2] for each in (*maps.values(), factors, freedom)}
     if len(shapes) > 1 or maps["snr"].ndim != 2:
         raise ValueError(f"maps have the shapes {sorted(shapes)}")
@@ -324,14 +334,22 @@ def write_detection(detection: Any, folder: Path, *, overwrite: bool) -> list[Pa
         folder / "candidates.ecsv": detection.candidates,
         folder / "contrast.ecsv": detection.contrast_curve,
     }
-    require_new([maps, *tables, positions], overwrite)
+    beside = folder / _OTHER
+    require_new([maps, *tables, positions, beside], overwrite)
     write_fits(_hdus_of(detection), maps)
+    written = [maps]
+    if detection.other is None:
+        beside.unlink(missing_ok=True)
+    else:
+        write_fits(_hdus_of(detection.other), beside)
+        written.append(beside)
     for path, table in tables.items():
         write_table(table, path)
+        written.append(path)
     if detection.sky.north is None or detection.sky.mjd is None:
         positions.unlink(missing_ok=True)
-        return [maps, *tables]
-    return [maps, *tables, detection.write_astrometry(positions, overwrite=overwrite)]
+        return written
+    return [*written, detection.write_astrometry(positions, overwrite=overwrite)]
 
 
 def read_detection(
@@ -339,8 +357,8 @@ def read_detection(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a file of `write_detection`; see `Detection.read`.
 
-    Returns the fields of the class, and the cached properties that a new detection computes from
-    its fits, by name.
+    Returns the fields of the class, but for `other`, and the cached properties that a new detection
+    computes from its fits, by name.
     """
     path = path / "detection.fits" if path.is_dir() else path
     searched = (fit,) if isinstance(fit, Refinement) else tuple(fit or ())
@@ -362,16 +380,26 @@ def searched_fits(
     return fits, _groups_of(fits, digests, path)
 
 
+def fit_name(detection: str) -> str:
+    """Name of the file of the fit of a detection, by the name of the detection's file."""
+    return "fit_other.fits" if detection == _OTHER else "fit.fits"
+
+
+def other_file(path: Path) -> Path:
+    """File of the search that is deeper at some separations, of a detection in a file."""
+    return (path if path.is_dir() else path.parent) / _OTHER
+
+
 def _fit_beside(path: Path) -> Refinement:
     """Read the fit that was written to the folder of a detection's file.
 
     Raises `IncompatibleSetupError` if there is none, or none with its linear model.
     """
-    file = path.with_name("fit.fits")
+    file = path.with_name(fit_name(path.name))
     if not file.is_file():
         raise IncompatibleSetupError(
-            f"{path}: measurements need the linear model of the fit, and there is no fit.fits in "
-            "the same folder. Pass the fit that was searched: Detection.read(path, fit=fit)"
+            f"{path}: measurements need the linear model of the fit, and there is no {file.name} "
+            "in the same folder. Pass the fit that was searched: Detection.read(path, fit=fit)"
         )
     fit = Refinement.read(file)
     if fit.stored_linear is None:

@@ -51,6 +51,13 @@ def pixels_of(grid: Image, offsets: Image) -> Image:
     return np.asarray((offsets - origin) @ np.linalg.inv(steps).T)
 
 
+def is_within(region: NDArray[np.bool_], grid: Image, offsets: Image) -> NDArray[np.bool_]:
+    """Whether the pixels nearest to positions (k, 2), arcsec, are in a region (ny, nx)."""
+    nearest = np.rint(pixels_of(grid, offsets)).astype(int)
+    columns, rows = np.clip(nearest, 0, np.array(region.shape[::-1]) - 1).T
+    return np.asarray(region[rows, columns])
+
+
 def require_inside(offsets: Image, grid: Image) -> None:
     """Raise `IncompatibleSetupError` for positions (k, 2) outside the field.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +11,11 @@ import torch
 from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Maps
 from pyklip_diffrender.detection.error_factor import Significance
-from pyklip_diffrender.detection.field import Image, curve_separations, far_from
+from pyklip_diffrender.detection.field import Image, curve_separations, far_from, is_within
 from pyklip_diffrender.detection.measurement import significance_of
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.templates import groups_of
@@ -275,16 +276,16 @@ def completeness(
         raise IncompatibleSetupError(
             "completeness: got a detection without its fits, expected one from detect or reduce"
         )
-    maps = Maps(groups_of(detection.fits), progress)
-    known = detection.sources
-    significance = significance_of(detection.fits, maps, known.offsets, inner)
-    residual = maps.without(known)
+    searches = [_Searched.of(detection, inner, progress)]
+    if detection.other is not None:
+        searches.append(_Searched.of(detection.other, inner, progress))
+    grid, known = detection.grid, detection.sources
     curve = detection.contrast_curve
     limit_at, limits = curve["separation"].value, np.asarray(curve["small_sample"])
-    chosen = limit_at[1::2] if separations is None else curve_separations(maps.grid, separations)
-    free = detection.has_limits & far_from(maps.grid, known.offsets, CLEAR)
+    chosen = limit_at[1::2] if separations is None else curve_separations(grid, separations)
+    free = detection.has_limits & far_from(grid, known.offsets, CLEAR)
     places = [
-        _free_places(maps.grid, free, separation, angles, _GOLDEN * n)
+        _free_places(grid, free, separation, angles, _GOLDEN * n)
         for n, separation in enumerate(chosen)
     ]
     count = sum(map(len, places)) * len(strengths)
@@ -298,16 +299,17 @@ def completeness(
             if not len(offsets):
                 continue
             limit = float(np.exp(np.interp(separation, limit_at, np.log(limits))))
+            region = detection.of_other
+            is_of_other = region is not None and is_within(region, grid, offsets).any()
+            search = searches[int(is_of_other)]
+            light = limit * searches[0].star / search.star
             detected = np.zeros((len(strengths), len(offsets)), dtype=bool)
             for start in range(0, len(offsets), _BATCH):
                 part = offsets[start : start + _BATCH]
-                changes = maps.response(torch.from_numpy(part))
+                changes = search.maps.response(torch.from_numpy(part))
                 for n, (place, change) in enumerate(zip(part, changes, strict=True), start):
                     for s, strength in enumerate(strengths):
-                        snr = maps.snr(residual + strength * limit * change)
-                        detected[s, n] = _detects(
-                            significance, snr, detection, _NEAR * significance.resolution, place
-                        )
+                        detected[s, n] = search.finds(strength * light * change, place)
                         bar.update(1)
             rows += [
                 (separation, strength * limit, fraction, len(offsets))
@@ -325,7 +327,7 @@ def completeness(
     )
     table.meta = {
         "threshold": detection.threshold,
-        "false_alarm": significance.false_alarm(detection.threshold),
+        "false_alarm": searches[0].significance.false_alarm(detection.threshold),
     }
     for fraction in _FRACTIONS:
         reached = contrast_of_completeness(table, fraction)
@@ -382,12 +384,33 @@ def _free_places(
     return places[kept]
 
 
-def _detects(
-    significance: Significance, snr: Image, detection: Detection, reach: float, place: Image
-) -> bool:
-    """Whether a search of the map has a candidate within `reach` arcsec of the place."""
-    everywhere = np.ones(snr.shape, dtype=bool)
-    peaks = significance.significant_peaks(
-        snr, detection.sources.offsets, detection.threshold, everywhere
-    )
-    return any(np.hypot(*(significance.grid[peak] - place)) < reach for peak, _ in peaks)
+@dataclass(frozen=True)
+class _Searched:
+    """The maps of a search, without its candidates, to which planets are added."""
+
+    maps: Maps
+    significance: Significance
+    residual: Image  # (ny, nx), the numerator of the maps.
+    sources: Tensor  # (k, 2), x, y of the candidates from the star, arcsec.
+    threshold: float
+    star: float  # Flux of the star in the fit.
+
+    @classmethod
+    def of(cls, detection: Detection, inner: float, progress: bool) -> _Searched:
+        maps, known = Maps(groups_of(detection.fits), progress), detection.sources
+        return cls(
+            maps,
+            significance_of(detection.fits, maps, known.offsets, inner),
+            maps.without(known),
+            known.offsets,
+            detection.threshold,
+            detection.fits[0].frames[0].flux,
+        )
+
+    def finds(self, change: Image, place: Image) -> bool:
+        """Whether the search has a candidate near a place if the numerator changes by an image."""
+        snr = self.maps.snr(self.residual + change)
+        everywhere = np.ones(snr.shape, dtype=bool)
+        peaks = self.significance.significant_peaks(snr, self.sources, self.threshold, everywhere)
+        reach, grid = _NEAR * self.significance.resolution, self.significance.grid
+        return any(np.hypot(*(grid[peak] - place)) < reach for peak, _ in peaks)

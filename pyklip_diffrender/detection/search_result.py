@@ -28,6 +28,7 @@ from pyklip_diffrender.detection.candidates import (
 )
 from pyklip_diffrender.detection.detection_file import (
     digest,
+    other_file,
     provenance_of,
     read_detection,
     searched_fits,
@@ -35,7 +36,7 @@ from pyklip_diffrender.detection.detection_file import (
     write_detection,
 )
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, Sky, pixels_of
+from pyklip_diffrender.detection.field import Image, Sky, is_within, pixels_of
 from pyklip_diffrender.detection.measurement import (
     candidate_table,
     contrasts_at,
@@ -147,6 +148,12 @@ class Detection:
         x, y of the pixels from the star, arcsec.
     path : Path or None
         File that the detection was read from.
+    other : Detection or None
+        Search of another fit of the same frames, such as that of the target without reference
+        stars, where it is the deeper one at some separations.
+    of_other : ndarray of bool, (ny, nx), or None
+        Pixels whose maps, candidates and limits are those of `other`, relative to the star of
+        `fits`.
 
     Examples
     --------
@@ -179,6 +186,8 @@ class Detection:
     has_limits: NDArray[np.bool_]
     grid: Image
     path: Path | None = None
+    other: Detection | None = None
+    of_other: NDArray[np.bool_] | None = None
 
     def __repr__(self) -> str:
         return (
@@ -375,8 +384,22 @@ class Detection:
             fit; see `read`.
         NonFiniteError, ShapeError, UnitError
         """
-        raw, calibration = contrasts_at(self._searched[1], offsets, self.error_factor)
+        raw, calibration = self._contrasts_at(offsets)
         return measured_table(raw, calibration, self.sky, sigmas)
+
+    def _contrasts_at(self, offsets: ArrayLike) -> tuple[QTable, Image]:
+        """Contrasts at positions, see `contrasts_at`, of the search that is deeper at each."""
+        raw, calibration = contrasts_at(self._searched[1], offsets, self.error_factor)
+        if self.other is None or self.of_other is None:
+            return raw, calibration
+        places = np.stack([raw["x"].value, raw["y"].value], axis=1)
+        theirs, errors = self.other._contrasts_at(places)
+        # Relative to the star of this search, as the map is.
+        one, two = (each._searched[0][0].frames[0].flux for each in (self, self.other))
+        chosen = is_within(self.of_other, self.grid, places)
+        for name, unit in (("contrast", two / one), ("contrast_error", two / one), ("snr", 1.0)):
+            raw[name] = np.where(chosen, unit * theirs[name], raw[name])
+        return raw, np.where(chosen, errors, calibration)
 
     def measure_shape(self, image: ArrayLike, *, relinearise: float = 25.0) -> tuple[float, float]:
         """Measure an extended source of known shape in the first frame, such as a ring.
@@ -460,6 +483,8 @@ class Detection:
         - ERROR_FACTOR, FREEDOM: factor of the errors, and degrees of freedom of Student's t, which
           noise follows in units of these errors;
         - HAS_LIMITS: 1 for the pixels whose limits are in the contrast curve, else 0;
+        - OF_OTHER: 1 for the pixels of `other`, which has a file of its own,
+          detection_other.fits;
         - OFFSET_X, OFFSET_Y: position of every pixel from the star, arcsec;
         - SUBTRACTED, numbered by EXTVER: each frame without its star, candidates preserved;
         - DATA, ERROR, VALID: the first frame, its integrations averaged;
@@ -537,6 +562,8 @@ class Detection:
             For a fit other than the one that was searched.
         """
         searched, computed = read_detection(Path(path), fit)
+        if "of_other" in searched:
+            searched["other"] = cls.read(other_file(Path(path)))
         detection = cls(**searched)
         vars(detection).update(computed)
         return detection

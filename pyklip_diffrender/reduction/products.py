@@ -205,6 +205,8 @@ PRODUCTS = {
     "injections.ecsv": "injected planets and their measurements",
     "completeness.ecsv": "fraction of planets that the search finds, by contrast and separation",
     "fit.fits": "the fit, for Refinement.read",
+    "detection_other.fits": "the search of the other fit, with or without reference stars",
+    "fit_other.fits": "the other fit, whose limits are deeper at some separations",
     "systematics.fits": "the flat-field pattern, for other reductions",
 }
 """Every file that a reduction may write, with its content."""
@@ -255,6 +257,9 @@ def write_products(
     if fit:
         path = folder / "fit.fits"
         written.append(reduction.fit.write(path, linear=derivatives, overwrite=True))
+        if reduction.detection.other is not None:
+            other, path = reduction.detection.other.fits[0], folder / "fit_other.fits"
+            written.append(other.write(path, linear=derivatives, overwrite=True))
     if reduction.wide is not None:
         written += reduction.wide.write(folder, overwrite=True)
     if reduction.disk is not None:

@@ -98,7 +98,11 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
             ),
             *(_frame(each, uses.get(each.name, "not used")) for each in sequence.references),
         ],
-        "visit": {"gain": reduction.visit.gain, "contributions": contributions},
+        "visit": {
+            "gain": reduction.visit.gain,
+            "where": reduction.visit.where,
+            "contributions": contributions,
+        },
         "admission": plain_rows(sequence.table),
         "left_out": [
             *({"name": name, "reason": reason} for name, reason in sequence.excluded),

@@ -11,12 +11,14 @@ detector. What speaks against a frame is looked at in this order:
 2. A companion of a reference star that the joint fit shows is treated in the same way.
 3. Frames of a reference star that the joint fit does not explain as well as it does the target's
    are left out.
-4. If the limits of all frames together are not deeper than those of the target's frames alone,
-   which may have the library's pattern, the latter are kept.
+4. The limits of all frames together are compared with those of the target's frames alone, which
+   may have the library's pattern. At every separation the deeper ones are used (`deeper`); where
+   the target alone was fitted roughly, one of the two fits is kept as a whole.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections import Counter
@@ -34,8 +36,10 @@ from scipy.stats import chi2
 from pyklip_diffrender.detection import (
     Detection,
     ReferenceSource,
+    deeper,
     detect,
     sources_of_references,
+    stated_limits,
 )
 from pyklip_diffrender.detection.field import ring_pixels
 from pyklip_diffrender.detection.templates import groups_of, weigh
@@ -82,10 +86,6 @@ _UNLIKE = 0.14
 frame spoils the fit of all and lets it converge slowly. In frames of stpsf whose wavefronts differ
 by 2 nm it was 0.05, between real stars hours apart 0.125, and 0.155 to 0.165 for AU Mic with its
 disk. It grows as 1 / wavelength."""
-
-_DITHERED = 3
-"""Smallest number of frames of a star that join a target whose pattern the library knows: two rolls
-of another star made limits of G 7-34 shallower, and take three times the time of its own fit."""
 
 _STEPS = 20
 """Largest number of steps of the joint fit. Fits that converged took 7 to 12."""
@@ -146,9 +146,12 @@ class Visit:
 
     # One for each frame of a reference star.
     contributions: tuple[Contribution, ...] = ()
-    # Limits of the target's frames alone over those of the fit that was kept, in units of flux: the
-    # median over separations from 0.4 to 2 arcsec. NaN if the frames were not fitted together.
+    # Limits of the target's frames alone over those of the fit of all frames, in units of flux: the
+    # median over the separations from 0.4 to 2 arcsec at which the latter is used. NaN if it is
+    # used nowhere.
     gain: float = math.nan
+    # These separations in words, such as "at 0.2 to 0.5 arcsec"; empty for all.
+    where: str = ""
 
     def __repr__(self) -> str:
         return f"<Visit: {self.in_words()}>"
@@ -168,6 +171,7 @@ class Visit:
         if counts["wavefront"]:
             parts.append(
                 f"{counts['wavefront']} in the likelihood, limits {self.gain:.2f} times deeper"
+                f"{' ' + self.where if self.where else ''}"
             )
         if counts["pattern"]:
             parts.append(f"{counts['pattern']} for the flat-field pattern")
@@ -219,13 +223,6 @@ def with_references(
         return Joined(fit, Visit())
     left_out: dict[str, str] = {}
     used = _that_fit_into(memory, fit, references, left_out)
-    if search is not None:
-        every, used = used, worth_joining(used)
-        little = [each for each in every if not any(each is one for one in used)]
-        for each in little:
-            count = sum(one.target == each.target for one in little)
-            only = "1 frame" if count == 1 else f"{count} frames"
-            left_out[each.name] = f"only {only} of its star, and the pattern is known"
     pattern = pattern_for_visit(choice, [each.observation for each in fit.frames], used)
     settings = replace(
         fit.settings,
@@ -277,20 +274,52 @@ def with_references(
             left_out |= {each.name: reason for each in used}
     if joint is None or not joint.status.usable:
         return Joined(fit, Visit(_left_out(references, left_out)), alone)
-    together = None if search is None else search(joint)
-    gain = _gain(fit, joint) if alone is None or together is None else _stated_gain(alone, together)
-    _log.info("limits with the reference frames are %.2f times deeper than without", gain)
+    outcome = _kept(fit, joint, alone, None if search is None else search(joint))
+    if isinstance(outcome, str):
+        left_out |= {each.name: outcome for each in used}
+        return Joined(fit, Visit(_left_out(references, left_out)), alone)
+    kept, detection, gain, where = outcome
+    _log.info("limits with the reference frames are %.2f times deeper %s", gain, where)
+    contributions = _contributions(joint, references, left_out, remarks)
+    return Joined(kept, Visit(contributions, gain, where), detection)
+
+
+def _kept(
+    fit: Refinement, joint: Refinement, alone: Detection | None, together: Detection | None
+) -> tuple[Refinement, Detection | None, float, str] | str:
+    """The fit that is kept, its search, and where limits are deeper with the reference stars.
+
+    If they are deeper nowhere, it is the reason why the frames are not used.
+    """
     # Deeper limits of a fit whose errors are not calibrated are no gain over one whose are.
-    if gain > 1 and (joint.status.calibrated or not fit.status.calibrated):
-        visit = Visit(_contributions(joint, references, left_out, remarks), gain)
-        return Joined(joint, visit, together)
-    reason = (
-        f"the fit of all frames ended as {joint.status.name}"
-        if gain > 1
-        else f"limits would be {1 / gain:.2f} times those without it"
-    )
-    left_out |= {each.name: reason for each in used}
-    return Joined(fit, Visit(_left_out(references, left_out)), alone)
+    if fit.status.calibrated and not joint.status.calibrated:
+        return f"the fit of all frames ended as {joint.status.name}"
+    if alone is None or together is None:
+        gain = _gain(fit, joint)
+        if gain > 1:
+            return joint, together, gain, ""
+        return f"limits would be {1 / gain:.2f} times those without it"
+    separations, gains = _stated_gains(alone, together)
+    is_deeper = gains > 1
+    if not is_deeper.any():
+        return f"limits would be {1 / np.median(gains):.2f} times those without it"
+    # The fit that is deeper at most separations has the wavefront and the images of the products.
+    if np.median(gains) > 1:
+        kept, detection = joint, deeper(together, alone)
+    else:
+        kept, detection = fit, deeper(alone, together)
+    where = "" if is_deeper.all() else f"at {_in_ranges(separations, is_deeper)} arcsec"
+    return kept, detection, float(np.median(gains[is_deeper])), where
+
+
+def _in_ranges(separations: NDArray[np.float64], chosen: NDArray[np.bool_]) -> str:
+    """Chosen separations in words, such as "0.2 to 0.5 and 1.2"."""
+    ranges = []
+    for is_chosen, part in itertools.groupby(zip(separations, chosen, strict=True), lambda x: x[1]):
+        within = [f"{separation:.1f}" for separation, _ in part]
+        if is_chosen:
+            ranges.append(" to ".join(dict.fromkeys((within[0], within[-1]))))
+    return " and ".join([", ".join(ranges[:-1]), ranges[-1]] if ranges[1:] else ranges)
 
 
 def _companions(fit: Refinement, alone: Detection | None) -> tuple[Planet, ...]:
@@ -301,12 +330,6 @@ def _companions(fit: Refinement, alone: Detection | None) -> tuple[Planet, ...]:
     if alone is None or not (np.asarray(alone.candidates["snr"]) > _SHOWN).any():
         return fit.planets
     return alone.sources.planets()
-
-
-def worth_joining(references: Sequence[Observation]) -> list[Observation]:
-    """Frames of stars that were observed often enough, where the pattern is known."""
-    counts = Counter(each.target for each in references)
-    return [each for each in references if counts[each.target] >= _DITHERED]
 
 
 def _that_fit_into(
@@ -510,16 +533,13 @@ def _flux_errors(fit: Refinement) -> NDArray[np.float64]:
     return fit.frames[0].flux * np.array([np.median(each) for each in errors if len(each)])
 
 
-def _stated_gain(alone: Detection, joint: Detection) -> float:
-    """Stated limits of one search over those of another, in units of flux, the median."""
-    curves = []
-    for detection in (alone, joint):
-        curve = detection.contrast_curve
-        separations = curve["separation"].to_value("arcsec")
-        chosen = (separations >= _SEPARATIONS[0]) & (separations <= _SEPARATIONS[-1])
-        flux = detection.fits[0].frames[0].flux
-        curves.append(flux * np.asarray(curve["contrast"])[chosen if chosen.any() else ...])
-    return float(np.nanmedian(curves[0] / curves[1]))
+def _stated_gains(
+    alone: Detection, joint: Detection
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Separations, arcsec, and stated limits of one search over those of another, by flux."""
+    separations, limits = stated_limits(alone)
+    gains = limits / np.interp(separations, *stated_limits(joint))
+    return separations, gains
 
 
 def _drifts(joint: Refinement) -> NDArray[np.float64]:

@@ -42,6 +42,13 @@ whose wavefronts differ by 2 nm take the change for a shift of the star. Behind 
 the star up to 1.5 times too bright, and limits 1.5 times higher. In the long-wave channel it makes
 limits of two rolls of G 7-34 6 to 11 % higher from 0.4 to 1 arcsec, and is not used."""
 
+_CURRENT_MAP_DAYS = 60.0
+"""Days between map and frames up to which the scales of the preset hold: in the real frames with
+which they were measured, 50. The segments drift by 9 nm rms in 3.6 days (Feng et al. 2025, section
+4), and are corrected every 29 to 36 days on average, when the wavefront reaches 70 nm rms (JWST
+User Documentation, "Optics Performance and Stability"), so that the difference from an older map
+grows like a random walk."""
+
 _DRIFTS = (" drift", " dither")
 """Endings of the names of groups of modes in those of `drift` and `dither_drift`."""
 
@@ -278,6 +285,16 @@ class GaussNewton:
         # Some of what is freed does not return to the system at once.
         return max(0.0, 0.9 * self.memory - _PROCESS - arrays)
 
+    def for_map_of_age(self, days: float | None) -> GaussNewton:
+        """Return settings whose prior on the segments has grown with the age of the map, days.
+
+        They are the same for a map of unknown age, and if `adapt_prior` is False.
+        """
+        growth = math.sqrt(abs(days or 0.0) / _CURRENT_MAP_DAYS)
+        if not self.adapt_prior or growth <= 1:
+            return self
+        return replace(self, prior=self.prior.widened({"segment": growth}))
+
     def with_wider_priors(self, ratios: Mapping[str, float]) -> GaussNewton:
         """Return settings whose priors have scales multiplied by ratios above 1.
 
@@ -481,12 +498,11 @@ def quick_settings(observation: Observation) -> GaussNewton:
     """Settings for a first look: `settings_for` with fewer modes and coarser derivatives."""
     settings, faint = settings_for(observation), faintness(observation)
     share = next(share for least, share in _SHARES if faint >= least)
-    cycles = tuple(float(max(4, round(share * each))) for each in settings.cycles)
-    of_amplitude = settings.prior.amplitude_cycles
+    cycles = float(max(4, round(share * settings.cycles[0])))
     prior = settings.prior
-    if of_amplitude:
-        prior = replace(prior, amplitude_cycles=min(of_amplitude, cycles[0]))
-    return replace(settings, cycles=cycles, prior=prior, **_QUICK)
+    if prior.amplitude_cycles:
+        prior = replace(prior, amplitude_cycles=min(prior.amplitude_cycles, cycles))
+    return replace(settings, cycles=(cycles,), prior=prior, **_QUICK)
 
 
 def nircam_settings(observation: Observation, **changes: Any) -> GaussNewton:
