@@ -4,11 +4,15 @@ Run from the root of the project, with the frames of programmes 1184 and 1386 in
 
     python -m benchmarks.real_cases --output results --planets 28
 
-Every case is reduced with `reduce` as a user would, without its reference frames: every roll alone
-and both together, of three stars in two filters, and HIP 65426. Fits, products and one row of the
-table are kept per case, so that a run that was stopped goes on. For two rolls the table has the
-5-sigma contrast limits of `reduce` and of KLIP (`klip_curve`: the other roll and all frames of
-other stars, the best of 1 to 5 modes), both without and with their small-sample corrections, and
+Every case is reduced with `reduce` as a user would: every roll alone and both together, of three
+stars in two filters, and HIP 65426. Pairs are reduced with the package's library of patterns and
+with it taken away, as for a filter that is not in it, and with the two rolls of the other M dwarf as
+reference frames and without; of stars with a disk, these are the four rolls of both M dwarfs. KLIP
+has the same frames. Without references the library's pattern is still that of another star, so that
+only the cases without the library are like with like there. Fits, products and one row of the table
+are kept per case, so that a run that was stopped goes on. For two rolls the table has the 5-sigma
+contrast limits of `reduce` and of KLIP (`klip_curve`: the other roll and the reference frames, the
+best of 1 to 5 modes), both without and with their small-sample corrections, and
 "by ring": those of `reduce` with the noise of KLIP's curve, the scatter of the map of contrasts in
 a ring of width lambda/D with the correction of Mawet et al. (2014). "closed" is the part of the gap
 between KLIP's limit and that of a known star which is closed, (KLIP - ours) / (KLIP - known star)
@@ -32,6 +36,7 @@ import torch
 from astropy.table import Table, vstack
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.pattern import choice as patterns
 from pyklip_diffrender.reduction import summarise
 from pyklip_diffrender.reduction.klip import klip_curve, small_sample_factor
 
@@ -44,17 +49,32 @@ STARS = {"G-7-34": "star", "HIP17695": "star", "V-AU-MIC": "disk"}
 FILTERS = ("F444W", "F356W")
 
 
-def cases() -> list[tuple[str, str, str]]:
-    """Star, filter and rolls ("pair", "roll 1", "roll 2"), the most telling first."""
-    pairs = [(star, band, "pair") for star in STARS for band in FILTERS]
+Case = tuple[str, str, str, str, str]
+"""Star; filter; rolls ("pair", "roll 1", "roll 2"); the package's library of patterns ("library" or
+"no library"); frames of other stars ("references" or "no references")."""
+
+FORMS = (
+    ("no library", "references"),
+    ("no library", "no references"),
+    ("library", "references"),
+    ("library", "no references"),
+)
+
+
+def cases() -> list[Case]:
+    """All cases, the most telling first."""
+    pairs = [(star, band, "pair", *form) for form in FORMS for star in STARS for band in FILTERS]
     alone = [(star, band, f"roll {n}") for star in STARS for band in FILTERS for n in (1, 2)]
-    return [*pairs, ("HIP-65426", "F444W", "roll 1"), *alone]
+    rolls = [("HIP-65426", "F444W", "roll 1"), *alone]
+    return [*pairs, *((*each, "library", "no references") for each in rolls)]
 
 
 def reduce_case(
     star: str,
     band: str,
     rolls: str,
+    library: str,
+    references: str,
     data: Path,
     planets: int,
     folder: Path,
@@ -74,8 +94,12 @@ def reduce_case(
         sequence = dr.Sequence.from_files(data / "gto1184", target=star, filter=band)
         opd = data / "opd_2022-08-14.fits.gz"
     science = sequence.science if pair else sequence.science[int(rolls[-1]) - 1 :][:1]
+    others = [each for each in sequence.references if STARS.get(each.target) == "star"]
+    given = tuple(others) if references == "references" else ()
+    if library == "no library":
+        patterns.package_library = lambda: dr.PatternLibrary(())
     result = dr.reduce(
-        replace(sequence, science=science, references=()),
+        replace(sequence, science=science, references=given),
         start or opd,
         disk=STARS.get(star) == "disk",
         injections=injections,
@@ -89,6 +113,9 @@ def reduce_case(
         "star": star,
         "filter": band,
         "rolls": rolls,
+        "library": library,
+        "references": references,
+        "use": result.visit.in_words(),
         "status": result.fit.status.name,
         "chi2": round(result.fit.chi2_per_pixel, 3),
         "S/N scatter": round(float(np.nanstd(snr)), 3),
@@ -116,7 +143,7 @@ def reduce_case(
     ours["by_ring"] = 5 * np.array(scatter) * small_sample_factor(SEPARATIONS, resolution)
     row |= {name: values.tolist() for name, values in ours.items()}
     if pair:
-        klip = klip_curve(detection, sequence.cutout(SIZE).references, SEPARATIONS)
+        klip = klip_curve(detection, result.sequence.references, SEPARATIONS)
         row["KLIP"] = np.asarray(klip["contrast"]).tolist()
         row["KLIP small sample"] = np.asarray(klip["small_sample"]).tolist()
         row["modes"] = np.asarray(klip["modes"]).tolist()
@@ -137,8 +164,8 @@ def reduce_case(
 
 def print_tables(rows: list[dict[str, Any]]) -> None:
     """Print one row per case, and the limits of the pairs."""
-    short = ("star", "filter", "rolls", "status", "chi2", "S/N scatter", "S/N range",
-             "candidates", "CPU s", "GiB")  # fmt: skip
+    short = ("star", "filter", "rolls", "library", "references", "status", "chi2", "S/N scatter",
+             "S/N range", "candidates", "CPU s", "GiB")  # fmt: skip
     Table([{key: row[key] for key in short} for row in rows]).pprint_all()
     parts = []
     for row in rows:
@@ -168,9 +195,10 @@ def print_tables(rows: list[dict[str, Any]]) -> None:
         table = Table(columns)
         for name in ("ours", "KLIP", "ours, corrected", "KLIP, corrected", "by ring", "known star"):
             table[name].format = ".2e"
-        table.add_column([f"{row['star']} {row['filter']}"] * len(table), 0, "case")
+        case = " ".join(row[key] for key in ("star", "filter", "library", "references"))
+        table.add_column([case] * len(table), 0, "case")
         parts.append(table)
-        print(row["star"], row["filter"], "median (least) ratios:", end=" ")
+        print(case, "median (least) ratios:", end=" ")
         for name in ("ratio", "ratio, corrected", "ratio, by ring"):
             print(name, f"{np.median(table[name]):.2f} ({table[name].min():.2f})", end="; ")
         print("\n", row.get("injections", ""))
@@ -184,7 +212,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--planets", type=int, default=28)
-    parser.add_argument("--case", nargs=3, metavar=("STAR", "FILTER", "ROLLS"))
+    parser.add_argument(
+        "--case", nargs=5, metavar=("STAR", "FILTER", "ROLLS", "LIBRARY", "REFERENCES")
+    )
     parser.add_argument("--opd", help="map to start from; flat for none")
     parser.add_argument("--tables", action="store_true", help="only print those of earlier runs")
     options = parser.parse_args()

@@ -190,12 +190,6 @@ _log = logging.getLogger(__name__)
 _EXPLAINED = 1.2
 """Chi-squared per pixel below which the noise explains the residual."""
 
-_UNEXPLAINED_GAIN = 3e-3
-"""Gain in chi-squared per pixel of a step below which a fit ends that does not explain its data, if
-its own tolerance is not smaller. With the tolerance of a first look, one that starts from a map
-three months old ends where it explains the data of HIP 17695 nearly, and limits are 1.1 times
-higher."""
-
 _NEGLIGIBLE = 1e-3
 """Model error, as a fraction of the star, below which annealing ends."""
 
@@ -448,7 +442,7 @@ class Annealing:
         is_last = course.kappa <= floor and course.modes == len(self.basis)
         if is_last and self._drop_faint(course):
             return False
-        if is_last and self._is_little(gain, course.chi2):
+        if gain < self.settings.tolerance and is_last:
             return True
         course.kappa = min(_ANNEALING * course.kappa, course.error / 2)
         if course.kappa < max(_NEGLIGIBLE, floor):
@@ -705,14 +699,9 @@ class Annealing:
             state, gain, carried = self.solver.step(state, carried, kappa, modes)
             error, chi2 = self.objective.model_error(state), self.objective.chi2_per_pixel(state)
             self._record(kappa, modes, chi2, error, gain, carried.damping)
-            if self._is_little(gain, chi2):
+            if gain < self.settings.tolerance:
                 break
         return state, carried
-
-    def _is_little(self, gain: float, chi2: float) -> bool:
-        """Whether a step gains so little that the fit has converged."""
-        finest = math.inf if chi2 < _EXPLAINED else _UNEXPLAINED_GAIN
-        return gain < min(self.settings.tolerance, finest)
 
     def _leave_out_outliers(self, end: _Fitted, modes: int) -> bool:
         """Leave out bad pixels that stand alone; False if there are none.
