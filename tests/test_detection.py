@@ -24,7 +24,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics import PupilGrid
-from pyklip_diffrender.refinement import Status, refine_again
+from pyklip_diffrender.refinement import Status, annealing, fitting, refine_again
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.scene import Planet, world_coordinates
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
@@ -162,6 +162,18 @@ def test_a_prior_that_is_far_too_narrow_reaches_its_size_at_once(world, caplog):
     # A prior up to a quarter too wide is not narrowed.
     assert 0.85 < fit.scales["segment"] / likely.scales["segment"] < 1.25
     assert caplog.text.count("the wavefront is larger than its prior says") == 1
+
+
+def test_a_rough_fit_that_does_not_explain_its_data_goes_on(world, monkeypatch):
+    """It ends at a chi-squared of 0.997 per pixel, which is not enough here, and goes on."""
+    monkeypatch.setattr(annealing, "_EXPLAINED", 0.97)
+    observation = world.observed(world.expected(), 4)
+    fine = world.refined(observation, tolerance=0.2)
+    monkeypatch.setattr(fitting, "_FINER", np.inf)
+    rough = world.refined(observation, tolerance=0.2)
+    assert (rough.status, fine.status) == (Status.MODEL_MISMATCH, Status.CONVERGED)
+    assert fine.history[: len(rough.history)] == rough.history
+    assert len(fine.history) > len(rough.history)
 
 
 def test_the_prior_on_the_segments_is_wider_for_an_older_map(world):

@@ -48,6 +48,9 @@ _log = logging.getLogger(__name__)
 _STRUCTURE = 1.15
 """Reduced chi-squared above which a fit is repeated with more modes."""
 
+_FEWEST_CYCLES = 24.0
+"""Highest spatial frequency of the modes of settings that name none, and do not fit them."""
+
 _FINER = 3e-3
 """`GaussNewton.tolerance` with which a fit goes on that had a larger one, as a first look has, and
 does not explain its data. From a map three months old, it ends where it nearly explains those of
@@ -99,21 +102,19 @@ def fit_in_stages(
     basis.
     """
     pupil = problems[0].model.entrance
-    if settings.basis is not None or not settings.cycles:
-        basis = settings.basis or default_basis(pupil=pupil)
-        return Annealing(problems, settings, basis, warm, progress, same_frames).run()
-    # The number of modes that drift is fixed.
-    grows = settings.wavefront and settings.drift is None
-    cycles_to_try = settings.cycles if grows else settings.cycles[:1]
     fit: Refinement | None = None
-    for k, cycles in enumerate(cycles_to_try):
-        adapted = replace(settings, cycles=settings.cycles[k:])
-        if fit is not None:
-            _log.info("residuals have structure: adding modes up to %g cycles per pupil", cycles)
-            adapted, warm = continue_from(fit, cycles=settings.cycles[k:])
-        earlier, basis = fit, default_basis(cycles, pupil)
-        fit = Annealing(problems, adapted, basis, warm, progress, same_frames).run()
-        fit = _continued(earlier, fit)
+    # The number of modes that drift is fixed.
+    grows = settings.wavefront and settings.drift is None and settings.basis is None
+    for k in range(max(1, len(settings.cycles)) if grows else 1):
+        adapted, last = replace(settings, cycles=settings.cycles[k:]), fit
+        if last is not None:
+            _log.info("residuals have structure: modes up to %g cycles", settings.cycles[k])
+            adapted, warm = continue_from(last, cycles=settings.cycles[k:])
+        most = settings.cycles[k] if settings.cycles else _FEWEST_CYCLES
+        basis = settings.basis or default_basis(most, pupil)
+        fit = _continued(
+            last, Annealing(problems, adapted, basis, warm, progress, same_frames).run()
+        )
         if not fit.status.usable or not _STRUCTURE < fit.reduced_chi2 < _FOREIGN:
             break
     assert fit is not None

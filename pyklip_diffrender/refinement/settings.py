@@ -431,8 +431,8 @@ class GaussNewton:
                 amplitude_slope=0.5,
             ),
             adapt_prior=True,
-            # Without it, planets in pairs of rolls of stpsf came out at 0.96 of their contrast in the
-            # mean of three set-ups, with it at 1.02.
+            # Without it, six planets in pairs of rolls of stpsf came out at 0.96 of their contrast
+            # in the mean, with it at 1.02.
             marginal_flux=True,
             # Finer modes cost time and leave chi-squared within 3 %.
             cycles=(_cycles_to_edge(wavelength, reach),),
