@@ -23,7 +23,8 @@ from pyklip_diffrender.io.units import ARCSEC, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.planes import Detector
-from pyklip_diffrender.optics.system import OpticalSystem, poppy_psf, refuse_keywords
+from pyklip_diffrender.optics.psf_hdus import poppy_psf, refuse_keywords
+from pyklip_diffrender.optics.system import OpticalSystem
 
 # The fields at all planes as `poppy.Wavefront` objects.
 

@@ -36,13 +36,13 @@ from pyklip_diffrender.optics.planes import (
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.optics.system import (
-    OpticalSystem,
+from pyklip_diffrender.optics.psf_hdus import (
     poppy_psf,
     refuse_keywords,
     require_one_sampling,
     save,
 )
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.opd_map import check_opd, opd_to_hdus
 
 # Read the settings and the detector of an stpsf instrument without changing it.

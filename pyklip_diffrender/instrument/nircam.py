@@ -32,7 +32,8 @@ from pyklip_diffrender.optics.planes import (
     PixelCrosstalk,
     Plane,
 )
-from pyklip_diffrender.optics.system import OpticalSystem, Value
+from pyklip_diffrender.optics.propagation import Value
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 
 # NIRCam's internal wavefront error behind the Lyot stop, and its dependence on wavelength.

@@ -16,7 +16,8 @@ from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.fast_path import PlaneWaves
 from pyklip_diffrender.optics.grid import STAR_RADIUS, PupilGrid, doubled_samples, zernike_basis
 from pyklip_diffrender.optics.planes import CompactOcculter, Wavefront
-from pyklip_diffrender.optics.system import OpticalSystem, Propagation, batch_of
+from pyklip_diffrender.optics.propagation import Propagation, batch_of
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.wavefront.bases import Basis, FourierModes, fourier_part
 

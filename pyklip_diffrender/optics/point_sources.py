@@ -39,7 +39,8 @@ from pyklip_diffrender.optics.planes import (
     Plane,
     Wavefront,
 )
-from pyklip_diffrender.optics.system import OpticalSystem, Value, batch_of
+from pyklip_diffrender.optics.propagation import Value, batch_of
+from pyklip_diffrender.optics.system import OpticalSystem
 
 Index = ArrayLike | Tensor
 
