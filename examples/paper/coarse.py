@@ -26,7 +26,7 @@ class _CoarseSteps(OpticalSystem):
     def __init__(self, coarse: OpticalSystem, constants: dict[float, Tensor]) -> None:
         super().__init__(
             coarse.entrance,
-            coarse.planes,
+            coarse.between,
             coarse.detector,
             coarse.bandpass,
             recipe=coarse.recipe,

@@ -39,7 +39,7 @@ from pyklip_diffrender.bridges.sampled_planes import (
     turns_behind,
 )
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
+from pyklip_diffrender.io.units import ARCSEC, native_float64
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import Detector, Plane
@@ -63,13 +63,8 @@ class Conversion:
         self.osys, self.recipe, self.kinds = osys, recipe, kinds or {}
         self.dtype: torch.dtype = recipe["dtype"]
         self.device = torch.device(recipe["device"])
-        wavelengths = np.atleast_1d(to_metres(recipe["wavelength"], "wavelength"))
-        weights = recipe["weights"]
-        weights = np.ones(len(wavelengths)) if weights is None else native_float64(weights)
-        self.bandpass = Bandpass(
-            tuple(wavelengths.tolist()), tuple(np.atleast_1d(weights).tolist())
-        )
-        first = osys.input_wavefront(wavelengths[0] * u.m)
+        self.bandpass = Bandpass.of(recipe["wavelength"], recipe["weights"])
+        first = osys.input_wavefront(self.bandpass.wavelengths[0] * u.m)
         self.sampled = int(first.wavefront.shape[0])
         """Samples across the pupil at which poppy's optics are evaluated."""
         self.npix = int(recipe["npix"] or self.sampled)

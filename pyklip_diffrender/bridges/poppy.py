@@ -22,9 +22,8 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import resample
-from pyklip_diffrender.optics.planes import Detector
-from pyklip_diffrender.optics.psf_hdus import poppy_psf, refuse_keywords
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics.planes import Detector, Values
+from pyklip_diffrender.optics.system import REFUSED, OpticalSystem
 
 # The fields at all planes as `poppy.Wavefront` objects.
 
@@ -32,26 +31,27 @@ Array = NDArray[Any]
 
 
 def intermediate_wavefronts(
-    system: OpticalSystem,
-    orientations: Sequence[Orientation],
+    system: PoppySystem,
     normalize: str,
+    opd: Any,
+    parameters: Mapping[str, Any],
     only_last: bool,
 ) -> list[poppy.Wavefront]:
     """Fields as poppy's own objects, one per plane, weighted and summed as poppy does.
 
-    For an image plane, the field behind the mask on the sampled part of the image. `orientations`
-    are those of the planes relative to poppy's, the entrance pupil first; `normalize` must be
-    "first". With `only_last` there is the field on the detector alone.
+    For an image plane, the field behind the mask on the sampled part of the image. `normalize` must
+    be "first". With `only_last` there is the field on the detector alone.
     """
     if normalize.lower() != "first":
         raise IncompatibleSetupError(
             f"normalize={normalize!r}: intermediate wavefronts come with 'first' only"
         )
     summed: list[poppy.Wavefront] = []
+    tensor, values = system.opd(opd), system.values(parameters)
     for wavelength, weight in zip(
         system.bandpass.wavelengths, system.bandpass.weights, strict=True
     ):
-        for k, wave in enumerate(_wavefronts(system, orientations, wavelength, only_last)):
+        for k, wave in enumerate(_wavefronts(system, tensor, values, wavelength, only_last)):
             wave.wavefront = wave.wavefront * weight
             if k == len(summed):
                 summed.append(wave)
@@ -63,17 +63,15 @@ def intermediate_wavefronts(
 
 
 def _wavefronts(
-    system: OpticalSystem, orientations: Sequence[Orientation], wavelength: float, only_last: bool
+    system: PoppySystem, opd: Tensor, values: Values, wavelength: float, only_last: bool
 ) -> list[poppy.Wavefront]:
-    values = system.values({})
     full = system.entrance.full
     waves = []
     with torch.no_grad():
-        wavefront = system.pupil_field(system.opd(None), wavelength, values)
+        wavefront = system.pupil_field(opd, wavelength, values)
         windows = system.windows(values)
-        planes: list[Any] = [system.entrance, *system.planes]
-        for k, plane in enumerate(planes):
-            to_poppy = orientations[k].inverse
+        for k, plane in enumerate(system.planes[:-1]):
+            to_poppy = system.frames[k].inverse
             if isinstance(plane, SampledOcculter | FourierMask):
                 field, spacing = plane.focal_sample(wavefront)
                 wave = _wave_of(field, wavelength, full.diameter, spacing / ARCSEC)
@@ -84,7 +82,7 @@ def _wavefronts(
                     field = Orientation.inversion("y").then(to_poppy).apply(field)
                 wave.wavefront = _numpy(field)
             if k > 0:
-                wavefront = system.planes[k - 1].apply(wavefront, values, windows[k - 1])
+                wavefront = system.between[k - 1].apply(wavefront, values, windows[k - 1])
             if not isinstance(plane, SampledOcculter | FourierMask):
                 pupil = to_poppy.apply(wavefront.grid.crop(wavefront.field, full)) * full.spacing
                 wave = _wave_of(pupil, wavelength, full.diameter, None)
@@ -119,16 +117,11 @@ def _wave_of(
 
 # `from_poppy`: make a differentiable system of a poppy `OpticalSystem`, and export wavefronts.
 
-REFUSED = {
-    "save_intermediates": "this system writes no files of its own; pass return_intermediates=True "
-    "and call .writeto() on the wavefronts",
-    "display_intermediates": "display=True draws the PSF alone; pass return_intermediates=True and "
-    "call .display() on the wavefronts",
-    "progressbar": "a PSF of this system is not made in steps that take long; leave it out",
-    "inwave": "the entrance pupil makes the field of this system; give a wavefront as opd, and the "
-    "place of the source as star_offset",
-}
-"""Keywords of poppy's `calc_psf` that a converted system does not serve, and why."""
+WRITTEN_BY_CALLER = (
+    "this system writes no files of its own; pass return_intermediates=True and call .writeto() on "
+    "the wavefronts"
+)
+"""Why `save_intermediates` is refused."""
 
 _SUPPORTED = (
     "pupil and image planes of any optic with a transmission and an OPD, coordinate "
@@ -141,6 +134,12 @@ class PoppySystem(OpticalSystem):
 
     _source: ClassVar[str] = "osys"
     """Argument that defines the system, as opposed to settings of it."""
+    _refused: ClassVar[Mapping[str, str]] = {
+        "save_intermediates": WRITTEN_BY_CALLER,
+        "display_intermediates": "display=True draws the PSF alone; pass return_intermediates=True "
+        "and call .display() on the wavefronts",
+        **REFUSED,
+    }
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **OpticalSystem._replaced,
         "wavelength": ("weights",),
@@ -183,71 +182,15 @@ class PoppySystem(OpticalSystem):
             return super().at_wavelengths(bandpass)
         return self._remade(self._band(bandpass))
 
-    def calc_psf(  # type: ignore[override]  # As an OpticalSystem of poppy, not an Instrument.
-        self,
-        wavelength: Any = None,
-        weight: Any = None,
-        save_intermediates: bool = False,
-        save_intermediates_what: str = "all",
-        display: bool = False,
-        return_intermediates: bool = False,
-        return_final: bool = False,
-        source: dict[str, Any] | None = None,
-        normalize: str = "first",
-        display_intermediates: bool = False,
-        progressbar: bool = False,
-        inwave: poppy.Wavefront | None = None,
-        opd: Any = None,
-        **parameters: Any,
-    ) -> Any:
-        """PSF as an HDUList, with the arguments and the keywords of poppy's `calc_psf`.
+    def _intermediates(
+        self, normalize: str, opd: Any, parameters: Mapping[str, Any], only_last: bool
+    ) -> list[poppy.Wavefront]:
+        """See `intermediate_wavefronts`."""
+        return intermediate_wavefronts(self, normalize, opd, parameters, only_last)
 
-        Parameters
-        ----------
-        wavelength : Quantity, float (m) or sequence of them, optional
-            Default: the wavelengths that the system was made for.
-        weight : sequence of float, optional
-            One per wavelength; default equal.
-        source : dict, optional
-            With "wavelengths" and "weights", in place of the two above.
-        normalize : str
-            "first", "last", "exit_pupil" or "none", as in poppy.
-        return_intermediates, return_final : bool
-            Also return a list of `poppy.Wavefront`: one for every pupil plane and the detector,
-            or the one on the detector. They are summed over wavelengths as poppy does.
-        display : bool
-            Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
-        opd, **parameters
-            As in a call of the system.
-        save_intermediates, display_intermediates, progressbar, inwave
-            Refused with a pointer to what does the same.
-        save_intermediates_what
-            Without effect, as in poppy where no intermediate planes are saved.
-
-        Returns
-        -------
-        HDUList, or (HDUList, list of Wavefront)
-
-        Raises
-        ------
-        IncompatibleSetupError
-            For a keyword of poppy's that this system does not serve, with the reason, and for an
-            unknown `normalize`.
-        """
-        refuse_keywords(REFUSED, locals())
-        if source is not None:
-            wavelength, weight = source["wavelengths"], source["weights"]
-        system: Any = self
-        if wavelength is not None:
-            system = self.with_fidelity(wavelength=wavelength, weights=weight)
-        hdus = poppy_psf(system, normalize, opd, **parameters)
-        if display:
-            system.draw_psf(hdus, parameters)
-        if not (return_intermediates or return_final):
-            return hdus
-        return hdus, intermediate_wavefronts(
-            system, system.frames, normalize, only_last=not return_intermediates
-        )
+    def display(self, **keywords: Any) -> None:
+        """Draw all planes as poppy does, with the keywords of `display` of its optics."""
+        self.recipe[self._source].display(**keywords)
 
 
 def from_poppy(

@@ -16,12 +16,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.bridges.convert import Conversion
-from pyklip_diffrender.bridges.poppy import (
-    REFUSED,
-    PoppySystem,
-    check_supported,
-    intermediate_wavefronts,
-)
+from pyklip_diffrender.bridges.poppy import WRITTEN_BY_CALLER, PoppySystem, check_supported
 from pyklip_diffrender.bridges.sampled_planes import AberrationOptic, SplineRotation
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.headers import set_keyword
@@ -36,13 +31,8 @@ from pyklip_diffrender.optics.planes import (
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.optics.psf_hdus import (
-    poppy_psf,
-    refuse_keywords,
-    require_one_sampling,
-    save,
-)
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics.psf_hdus import poppy_psf, require_one_sampling
+from pyklip_diffrender.optics.system import InstrumentSystem, OpticalSystem
 from pyklip_diffrender.wavefront.opd_map import check_opd, opd_to_hdus
 
 # Read the settings and the detector of an stpsf instrument without changing it.
@@ -253,7 +243,7 @@ def _crosstalk(instrument: Any, header: Any) -> list[Array]:
 # `from_webbpsf`: make a system of an stpsf (webbpsf) NIRCam object, and export wavefronts.
 
 
-class WebbSystem(PoppySystem):
+class WebbSystem(PoppySystem, InstrumentSystem):
     """A `PoppySystem` made from an stpsf instrument by `from_webbpsf`."""
 
     instrument: Any  # the model's own copy, as of its conversion
@@ -261,6 +251,7 @@ class WebbSystem(PoppySystem):
     # does from 2.2.0 on; None without one.
     si_wfe_flipped: bool | None
     _source: ClassVar[str] = "nircam"
+    _refused: ClassVar[Mapping[str, str]] = {"save_intermediates": WRITTEN_BY_CALLER}
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **PoppySystem._replaced,
         "monochromatic": ("bandpass",),
@@ -288,86 +279,38 @@ class WebbSystem(PoppySystem):
             changes = {"bandpass": self.bandpass, **changes}
         return super()._remade(changes)
 
-    def calc_psf(  # type: ignore[override]  # An instrument's arguments, not an OpticalSystem's.
+    def _changes(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Arguments of `calc_psf`, which are settings of `from_webbpsf`."""
+        return given
+
+    def _extensions(
         self,
-        outfile: str | os.PathLike[str] | None = None,
-        source: Any = None,
-        nlambda: int | None = None,
-        monochromatic: Any = None,
-        fov_arcsec: float | None = None,
-        fov_pixels: int | tuple[int, int] | None = None,
-        oversample: int | None = None,
-        detector_oversample: int | None = None,
-        fft_oversample: int | None = None,
-        overwrite: bool = True,
-        display: bool = False,
-        save_intermediates: bool = False,
-        return_intermediates: bool = False,
-        normalize: str = "first",
-        add_distortion: bool = True,
-        crop_psf: bool = True,
-        opd: Any = None,
-        **parameters: Any,
-    ) -> Any:
-        """PSF as an HDUList, with the arguments, extensions and keywords of stpsf's `calc_psf`.
-
-        Arguments that are not given keep the values that the system was made with. The image is
-        this system's; stpsf itself then adds jitter, distortion, detector effects and header.
-
-        Parameters
-        ----------
-        opd, **parameters
-            As in a call of the system, for the PSF of a refined wavefront.
-        display : bool
-            Draw the PSF, extension OVERSAMP, in a new figure of matplotlib on a logarithmic scale.
-        save_intermediates
-            Refused with a pointer to `return_intermediates`.
-
-        Returns
-        -------
-        HDUList, or (HDUList, list of poppy.Wavefront)
-            OVERSAMP, DET_SAMP, OVERDIST and DET_DIST, the last two with `add_distortion`.
-        """
-        refuse_keywords(
-            {"save_intermediates": REFUSED["save_intermediates"]},
-            {"save_intermediates": save_intermediates},
-        )
-        arguments = {
-            "source": source,
-            "nlambda": nlambda,
-            "monochromatic": monochromatic,
-            "fov_arcsec": fov_arcsec,
-            "fov_pixels": fov_pixels,
-            "oversample": oversample,
-            "detector_oversample": detector_oversample,
-            "fft_oversample": fft_oversample,
-        }
-        changes = {name: value for name, value in arguments.items() if value is not None}
-        system: Any = self.with_fidelity(**changes)
-        result = poppy_psf(system, normalize, opd, **parameters)
-        instrument = system.instrument
+        normalize: str,
+        opd: Any,
+        parameters: Mapping[str, Any],
+        options: Mapping[str, Any],
+    ) -> fits.HDUList:
+        """The image of this system, to which stpsf adds jitter, distortion, detector and header."""
+        result = poppy_psf(self, normalize, opd, **parameters)
+        instrument = self.instrument
         options = {
             **instrument.options,
-            "add_distortion": add_distortion,
-            "crop_psf": crop_psf,
-            "detector_oversample": system.detector.oversample,
-            "fft_oversample": oversampling(system.recipe)[0],
+            **options,
+            "detector_oversample": self.detector.oversample,
+            "fft_oversample": oversampling(self.recipe)[0],
         }
         with kernel_files_left_open():
             instrument._apply_jitter(result, options)
             instrument._get_fits_header(result, options)
             instrument._calc_psf_format_output(result, options)
-        if system.si_wfe_flipped is not None:
+        if self.si_wfe_flipped is not None:
             for hdu in result:
-                set_keyword(hdu.header, "DRSIFLIP", system.si_wfe_flipped)
-        save(result, outfile, overwrite)
-        if display:
-            system.draw_psf(result, parameters)
-        if return_intermediates:
-            return result, intermediate_wavefronts(
-                system, system.frames, normalize, only_last=False
-            )
+                set_keyword(hdu.header, "DRSIFLIP", self.si_wfe_flipped)
         return result
+
+    def display(self, **keywords: Any) -> None:
+        """Draw all planes as stpsf does, which takes no keywords."""
+        private_copy(self.instrument).display(**keywords)
 
 
 def from_webbpsf(

@@ -308,7 +308,7 @@ _ROWS = 128
 
 def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
     """Return the number of pupil samples of `coarse_copy`."""
-    masks = [plane.radius for plane in model.planes if isinstance(plane, CompactOcculter)]
+    masks = [plane.radius for plane in model.between if isinstance(plane, CompactOcculter)]
     reach = _bar_reach(model) or max(masks, default=0.0)
     period = max(_field(model), reach + STAR_RADIUS)
     npix = doubled_samples(npix, period, min(model.bandpass.wavelengths), model.diameter)
@@ -343,7 +343,7 @@ def _field(model: OpticalSystem) -> float:
 
 def _bar_reach(model: OpticalSystem) -> float | None:
     """Distance from the star up to which a bar matters for derivatives, arcsec; None: no bar."""
-    bars = [p for p in model.planes if isinstance(p, CompactOcculter) and p.reach[0] > p.reach[1]]
+    bars = [p for p in model.between if isinstance(p, CompactOcculter) and p.reach[0] > p.reach[1]]
     if not bars or "bar_reach" not in model.adjustable:
         return None
     return min(bars[0].reach[0], _field(model) / 2 + STAR_RADIUS)

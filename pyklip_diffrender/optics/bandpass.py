@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.io.units import native_float64, to_metres
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,13 @@ class Bandpass:
             )
         total = sum(self.weights)
         object.__setattr__(self, "weights", tuple(w / total for w in self.weights))
+
+    @classmethod
+    def of(cls, wavelengths: Any, weights: Any = None) -> Bandpass:
+        """A bandpass of a Quantity or number (m), or several; weights are equal by default."""
+        waves = np.atleast_1d(to_metres(wavelengths, "wavelength"))
+        shares = np.ones(len(waves)) if weights is None else native_float64(weights)
+        return cls(tuple(waves.tolist()), tuple(np.atleast_1d(shares).tolist()))
 
     def thinned(self, count: int) -> tuple[tuple[int, ...], Bandpass]:
         """Keep `count` wavelengths, evenly spread, with all weights: indices, and a bandpass."""

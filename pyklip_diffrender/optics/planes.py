@@ -234,6 +234,9 @@ class Plane(ABC):
     # True if it is known only at the wavelengths that it was made for.
     sampled: bool = False
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name!r}, {'image' if self.focal else 'pupil'} plane>"
+
     def window(self, values: Values) -> PupilGrid | None:
         """Return the part of the pupil that this plane passes on; None for all of it."""
         return None
@@ -282,6 +285,9 @@ class EntrancePupil:
         self.amplitude = full.crop(amplitude / torch.sqrt(power), self.grid).to(dtype)
         self.lit = amplitude > 0
         """Samples that transmit light, (npix, npix)."""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name!r}, {self.full.npix} px pupil>"
 
     def on_window(self, maps: Tensor) -> Tensor:
         """OPD maps (..., npix, npix) on the samples of the field, (..., rows, columns)."""
@@ -494,7 +500,7 @@ class CompactOcculter(Plane):
 # The pixel array: sampling of the field, and pixel values from the samples.
 
 
-@dataclass
+@dataclass(repr=False)
 class Detector:
     """The pixel array."""
 
@@ -513,6 +519,10 @@ class Detector:
     _transforms: Cache[tuple[float, PupilGrid], MatrixFourier] = field(
         default_factory=Cache, init=False, repr=False, compare=False
     )
+
+    def __repr__(self) -> str:
+        (ny, nx), scale = self.shape, self.pixelscale[0]
+        return f"<{type(self).__name__} {self.name!r}, {nx} x {ny} px of {scale:.4g} arcsec>"
 
     def axes(self, values: Values) -> tuple[Tensor, Tensor]:
         """Sample positions x, y on the image relative to the optical axis, radians."""
@@ -685,7 +695,7 @@ class PixelCrosstalk:
         return torch.nn.functional.conv2d(images, turned, padding=padding).reshape(image.shape)
 
 
-@dataclass
+@dataclass(repr=False)
 class ChainDetector(Detector):
     """A detector with effects, in order, before and after the samples are binned to pixels."""
 

@@ -107,7 +107,7 @@ class PointSources:
             planes = _one_mask(self.model, wavelength)
             if planes is None:
                 return []
-            self._reduced |= planes != list(self.model.planes)
+            self._reduced |= planes != list(self.model.between)
             masks = [plane.radius for plane in planes if isinstance(plane, CompactOcculter)]
             self._radius = max(self._radius, *masks, 0.0)
             waves.append(self._wave(planes, wavelength, sampling))
@@ -239,7 +239,7 @@ def _one_mask(model: OpticalSystem, wavelength: float) -> list[Plane] | None:
     Returns None unless the planes are at most one mask between factors in the pupil.
     """
     planes: list[Plane] = []
-    for plane in model.planes:
+    for plane in model.between:
         each: Plane | None = plane
         if plane.focal:
             each = plane.compact(wavelength, model.dtype, model.device)

@@ -76,14 +76,14 @@ class Propagation:
     def __init__(
         self,
         entrance: EntrancePupil,
-        planes: Sequence[Plane],
+        between: Sequence[Plane],
         detector: Detector,
         bandpass: Bandpass,
         route: str = "auto",
         defaults: Mapping[str, Value] | None = None,
     ) -> None:
         self.entrance = entrance
-        self.planes = tuple(planes)
+        self.between = tuple(between)
         self.detector = detector
         self.bandpass = bandpass
         self._lattice = self._choose_route(route)
@@ -102,20 +102,25 @@ class Propagation:
             )
         if route == "planes":
             return None
-        if not LatticeRoute.serves(self.planes):
+        if not LatticeRoute.serves(self.between):
             if route == "auto":
                 return None
             raise IncompatibleSetupError(
                 "route 'lattice': the planes are not one round occulter between factors in "
                 "pupils; use 'auto' or 'planes'"
             )
-        lattice = LatticeRoute(self.planes, self.detector)
+        lattice = LatticeRoute(self.between, self.detector)
         return lattice if route == "lattice" or lattice.pays(self.bandpass.wavelengths) else None
 
     @property
     def route(self) -> str:
         """How light gets to the detector: "lattice" or "planes"."""
         return "planes" if self._lattice is None else "lattice"
+
+    @property
+    def planes(self) -> tuple[EntrancePupil | Plane | Detector, ...]:
+        """All planes, from the entrance pupil to the detector."""
+        return (self.entrance, *self.between, self.detector)
 
     @property
     def npix(self) -> int:
@@ -145,8 +150,7 @@ class Propagation:
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters that this system takes besides the OPD."""
-        between = [name for plane in self.planes for name in plane.parameters]
-        return (*self.entrance.parameters, *between, *self.detector.parameters)
+        return tuple(name for plane in self.planes for name in plane.parameters)
 
     def opd(self, opd: Value | None) -> Tensor:
         """Check an OPD and bring it to the system's device: (..., npix, npix) in m.
@@ -217,7 +221,7 @@ class Propagation:
         """For every plane, the pupil window that it must pass on, given the planes behind it."""
         needed = self.entrance.full
         passed: list[PupilGrid] = []
-        for plane in reversed(self.planes):
+        for plane in reversed(self.between):
             passed.append(needed)
             # A mask acts on all the light in front of it, not only on what is needed behind.
             needed = plane.window(values) or (self.entrance.full if plane.focal else needed)
@@ -231,7 +235,7 @@ class Propagation:
 
     def behind_planes(self, wavefront: Wavefront, values: Values) -> Wavefront:
         """The wavefront behind the last plane, one plane after the other."""
-        for plane, onto in zip(self.planes, self.windows(values), strict=True):
+        for plane, onto in zip(self.between, self.windows(values), strict=True):
             wavefront = plane.apply(wavefront, values, onto)
         return wavefront
 
@@ -248,13 +252,13 @@ class Propagation:
     @property
     def _last_occulter(self) -> int:
         """Number of planes up to the last occulter."""
-        return max((k + 1 for k, plane in enumerate(self.planes) if plane.focal), default=0)
+        return max((k + 1 for k, plane in enumerate(self.between) if plane.focal), default=0)
 
     @property
     def parameters_behind(self) -> frozenset[str]:
         """Names of the parameters of the planes behind the last occulter, and of the detector."""
-        behind = {n for plane in self.planes[self._last_occulter :] for n in plane.parameters}
-        before = {n for plane in self.planes[: self._last_occulter] for n in plane.parameters}
+        behind = {n for plane in self.between[self._last_occulter :] for n in plane.parameters}
+        before = {n for plane in self.between[: self._last_occulter] for n in plane.parameters}
         names = behind | set(self.detector.parameters)
         return frozenset(names - before - set(self.entrance.parameters))
 
@@ -267,14 +271,14 @@ class Propagation:
         windows = self.windows(values)
         if self._lattice is not None:
             return self._lattice.behind_occulter(wavefront, values, windows)
-        for plane, onto in zip(self.planes[: self._last_occulter], windows, strict=False):
+        for plane, onto in zip(self.between[: self._last_occulter], windows, strict=False):
             wavefront = plane.apply(wavefront, values, onto)
         return wavefront
 
     def to_detector(self, wavefront: Wavefront, values: Values) -> Tensor:
         """Field on the detector's samples from that in the pupil behind the last occulter."""
         first = self._last_occulter
-        for plane, onto in zip(self.planes[first:], self.windows(values)[first:], strict=True):
+        for plane, onto in zip(self.between[first:], self.windows(values)[first:], strict=True):
             wavefront = plane.apply(wavefront, values, onto)
         return self.detector.field(wavefront, values)
 
@@ -284,7 +288,7 @@ class Propagation:
         It is that of the planes in pupils, such as the Lyot stop, at the mean wavelength.
         """
         open_path = copy.copy(self)
-        open_path.planes = tuple(each for each in self.planes if not each.focal)
+        open_path.between = tuple(each for each in self.between if not each.focal)
         values = self.values(parameters)
         with torch.no_grad():
             wavefront = self.pupil_field(self.opd(opd), self.bandpass.mean_wavelength, values)
@@ -357,7 +361,7 @@ class Propagation:
         wavelength = wavelength or self.bandpass.wavelengths[0]
         wavefront = self.pupil_field(tensor, wavelength, values)
         fields = {self.entrance.name: wavefront.field}
-        for plane, onto in zip(self.planes, self.windows(values), strict=True):
+        for plane, onto in zip(self.between, self.windows(values), strict=True):
             if isinstance(plane, CompactOcculter):
                 fields[f"{plane.name} focus"] = plane.focal_field(wavefront)
             wavefront = plane.apply(wavefront, values, onto)

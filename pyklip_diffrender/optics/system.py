@@ -21,20 +21,24 @@ from pyklip_diffrender.optics.propagation import Propagation, Value
 from pyklip_diffrender.optics.psf_hdus import (
     Array,
     instrument_psf,
+    poppy_psf,
     refuse_keywords,
     require_one_sampling,
     save,
 )
 
-_REFUSED = {
-    "save_intermediates": "this system writes no files of its own; debug(opd) returns the field at "
-    "every plane",
-    "return_intermediates": "this system has no poppy.Wavefront objects, as systems of from_poppy "
-    "and from_webbpsf have; debug(opd) returns the field at every plane",
-    "add_distortion": "distortion and charge diffusion are modelled by from_webbpsf only; leave it "
-    "out for OVERSAMP and DET_SAMP alone",
+_DEBUG = "debug(opd) returns the field at every plane"
+_NO_WAVEFRONTS = (
+    "this system has no poppy.Wavefront objects, as systems of from_poppy and from_webbpsf have; "
+    f"{_DEBUG}"
+)
+
+REFUSED = {
+    "progressbar": "a PSF of this system is not made in steps that take long; leave it out",
+    "inwave": "the entrance pupil makes the field of this system; give a wavefront as opd, and the "
+    "place of the source as star_offset",
 }
-"""Keywords of stpsf's `calc_psf` that `OpticalSystem.calc_psf` does not serve, and why."""
+"""Keywords of `calc_psf` of poppy's `OpticalSystem` that no system serves, and why."""
 
 _BAND = ("monochromatic", "nlambda", "source", "wavelength")
 """Settings that determine the wavelengths."""
@@ -48,7 +52,7 @@ class OpticalSystem(Propagation):
     Parameters
     ----------
     entrance : EntrancePupil
-    planes : sequence of Plane
+    between : sequence of Plane
         The planes in between, in order. Each is linear in the field.
     detector : Detector
     bandpass : Bandpass
@@ -68,6 +72,8 @@ class OpticalSystem(Propagation):
 
     Attributes
     ----------
+    planes : tuple
+        The entrance pupil, the planes in between, the detector.
     defaults : dict of str to Tensor
     maker : callable or None
         `remake`.
@@ -103,7 +109,7 @@ class OpticalSystem(Propagation):
     def __init__(
         self,
         entrance: EntrancePupil,
-        planes: Sequence[Plane],
+        between: Sequence[Plane],
         detector: Detector,
         bandpass: Bandpass,
         recipe: dict[str, Any] | None = None,
@@ -111,18 +117,16 @@ class OpticalSystem(Propagation):
         route: str = "auto",
         defaults: Mapping[str, Value] | None = None,
     ) -> None:
-        super().__init__(entrance, planes, detector, bandpass, route, defaults)
+        super().__init__(entrance, between, detector, bandpass, route, defaults)
         self.recipe = dict(recipe or {})
         self.maker = remake
         self._other_bandpass: Bandpass | None = None
 
     def __repr__(self) -> str:
-        names = ", ".join(
-            [self.entrance.name, *(plane.name for plane in self.planes), self.detector.name]
-        )
+        names = ", ".join(plane.name for plane in self.planes)
         waves = len(self.bandpass.wavelengths)
         return (
-            f"<OpticalSystem: {names}; {self.npix} px pupil, {waves} wavelength"
+            f"<{type(self).__name__}: {names}; {self.npix} px pupil, {waves} wavelength"
             f"{'s' if waves > 1 else ''} about {self.bandpass.mean_wavelength * 1e6:.2f} um, "
             f"{self.detector.shape[1]} x {self.detector.shape[0]} px>"
         )
@@ -213,7 +217,7 @@ class OpticalSystem(Propagation):
     @property
     def _is_sampled(self) -> bool:
         """Whether planes are known only at the wavelengths of the bandpass."""
-        return self.entrance.sampled or any(plane.sampled for plane in self.planes)
+        return self.entrance.sampled or any(plane.sampled for plane in self.between)
 
     def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
         """Another system from the same recipe with some changes."""
@@ -226,86 +230,114 @@ class OpticalSystem(Propagation):
         }
         return self.maker(**{**self.recipe, **dropped, **changes})
 
+    _refused: ClassVar[Mapping[str, str]] = {
+        "save_intermediates": f"this system writes no files of its own; {_DEBUG}",
+        "return_intermediates": _NO_WAVEFRONTS,
+        "return_final": _NO_WAVEFRONTS,
+        "display_intermediates": f"display=True draws the PSF alone; {_DEBUG}",
+        **REFUSED,
+    }
+    """Keywords of `calc_psf` that this system does not serve, and why."""
+
     def calc_psf(
         self,
-        outfile: str | os.PathLike[str] | None = None,
-        source: Any = None,
-        nlambda: int | None = None,
-        monochromatic: float | None = None,
-        fov_arcsec: float | None = None,
-        fov_pixels: int | tuple[int, int] | None = None,
-        oversample: int | None = None,
-        detector_oversample: int | None = None,
-        fft_oversample: int | None = None,
-        overwrite: bool = True,
-        display: bool = False,
+        wavelength: Any = None,
+        weight: Any = None,
         save_intermediates: bool = False,
+        save_intermediates_what: str = "all",
+        display: bool = False,
         return_intermediates: bool = False,
+        return_final: bool = False,
+        source: Mapping[str, Any] | None = None,
         normalize: str = "first",
-        add_distortion: bool = False,
-        crop_psf: bool = True,
+        display_intermediates: bool = False,
+        progressbar: bool = False,
+        inwave: Any = None,
         opd: Value | None = None,
         **parameters: Value,
-    ) -> fits.HDUList:
-        """PSF as an HDUList, with the arguments of `calc_psf` of poppy's and stpsf's instruments.
-
-        Arguments that are not given keep the values that the system was made with.
+    ) -> Any:
+        """PSF as an HDUList, with the arguments of `calc_psf` of poppy's `OpticalSystem`.
 
         Parameters
         ----------
-        source : float, Quantity, (wavelengths, photons) or mapping, optional
-            Temperature (K) or spectrum of the star, or "wavelengths" (m) and "weights" of the PSF.
-        oversample, detector_oversample, fft_oversample : int, optional
-            Samples per pixel, and per lambda/D on the occulter; the first sets both.
-        outfile : path, optional
-            Write the result there.
-        display : bool
-            Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
+        wavelength : Quantity, float (m) or sequence of them, optional
+            Default: the wavelengths that the system was made for.
+        weight : sequence of float, optional
+            One per wavelength; default equal.
+        source : dict, optional
+            With "wavelengths" and "weights", in place of the two above.
         normalize : str
             "first", "last", "exit_pupil" or "none", as in poppy.
-        save_intermediates, return_intermediates, add_distortion
-            Refused with a pointer to what does the same.
-        crop_psf
-            Without effect, as in stpsf where there is no distortion.
+        return_intermediates, return_final : bool
+            Also return a list of `poppy.Wavefront`, one for every plane or the one on the detector,
+            summed over wavelengths as in poppy. Only systems of `from_poppy` have them.
+        display : bool
+            Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
         opd, **parameters
             As in a call of the system.
+        save_intermediates, display_intermediates, progressbar, inwave
+            Refused with a pointer to what does the same.
+        save_intermediates_what
+            Without effect, as in poppy where no intermediate planes are saved.
 
         Returns
         -------
-        HDUList
-            Extensions OVERSAMP and DET_SAMP.
+        HDUList, or (HDUList, list of Wavefront)
 
         Raises
         ------
         IncompatibleSetupError
-            For a keyword of stpsf's that this system does not serve, with the reason, and for a
-            setting that it cannot change.
+            For a keyword that this system does not serve, with the reason, for wavelengths at which
+            its planes are not known, and for an unknown `normalize`.
         """
-        refuse_keywords(_REFUSED, locals())
-        require_one_sampling(oversample, detector_oversample, fft_oversample)
-        bandpass = None
-        if isinstance(source, Mapping):
-            # As stpsf: wavelengths and weights of the PSF, in place of a spectrum and a filter.
-            bandpass = Bandpass(*(tuple(source[name]) for name in ("wavelengths", "weights")))
-        changes = {
-            "bandpass": bandpass,
-            "source": source if bandpass is None else None,
-            "nlambda": nlambda,
-            "monochromatic": monochromatic,
-            "fov_arcsec": fov_arcsec,
-            "fov_pixels": fov_pixels,
-            "oversample": oversample if detector_oversample is None else detector_oversample,
-            "occulter_sampling": oversample if fft_oversample is None else fft_oversample,
-        }
-        system = self.with_fidelity(**{k: v for k, v in changes.items() if v is not None})
-        sampling = system.recipe.get("occulter_sampling")
-        hdus = instrument_psf(system, system.setup, sampling, normalize, opd, **parameters)
-        save(hdus, outfile, overwrite)
+        refuse_keywords(self._refused, locals())
+        if source is not None:
+            wavelength, weight = source["wavelengths"], source["weights"]
+        system = self
+        if wavelength is not None or weight is not None:
+            waves = self.bandpass.wavelengths if wavelength is None else wavelength
+            system = self.at_wavelengths(Bandpass.of(waves, weight))
+        wavefronts = None
+        if return_intermediates or return_final:
+            only_last = not return_intermediates
+            wavefronts = system._intermediates(normalize, opd, parameters, only_last)
+        hdus = poppy_psf(system, normalize, opd, **parameters)
         if display:
-            system.draw_psf(hdus, parameters)
-        return hdus
+            system._draw_psf(hdus, parameters)
+        return hdus if wavefronts is None else (hdus, wavefronts)
 
-    def draw_psf(self, hdus: fits.HDUList, parameters: Mapping[str, Value]) -> None:
+    def _intermediates(
+        self, normalize: str, opd: Value | None, parameters: Mapping[str, Value], only_last: bool
+    ) -> list[Any]:
+        """Fields at the planes as `poppy.Wavefront`; systems without them refuse the keyword."""
+        raise NotImplementedError
+
+    def describe(self) -> str:
+        """A table of all planes, one per line, for ``print``; poppy's `describe` prints itself."""
+        return "\n\t".join(map(repr, (self, *self.planes)))
+
+    def display(self, **keywords: Any) -> None:
+        """Draw the system in a new figure, as `plot` does.
+
+        Parameters
+        ----------
+        **keywords
+            Keywords of `display` of poppy's optics, for systems of `from_poppy`, which draw all
+            their planes as poppy does. Other systems refuse them.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For keywords if the planes are not poppy's.
+        """
+        for name, value in keywords.items():
+            raise IncompatibleSetupError(
+                f"{name}={value!r}: the planes of this system are no optics of poppy; plot(ax, "
+                "opd=...) takes the axes to draw in and a wavefront"
+            )
+        self.plot()
+
+    def _draw_psf(self, hdus: fits.HDUList, parameters: Mapping[str, Value]) -> None:
         """Draw the oversampled image of a PSF in a new figure, for poppy's ``display=True``."""
         (ax,) = drawing.axes_for(None, 1)
         self._draw_image(ax, hdus[0].data, self.values(parameters), "PSF")
@@ -369,3 +401,123 @@ class OpticalSystem(Propagation):
         """Amplitude of a wavefront on the whole pupil array."""
         whole = wavefront.grid.crop(wavefront.field.abs(), self.entrance.full)
         return np.asarray(whole.double().cpu().numpy())
+
+
+class InstrumentSystem(OpticalSystem):
+    """An `OpticalSystem` that is used as an instrument of stpsf; see `nircam_coronagraph`."""
+
+    _refused: ClassVar[Mapping[str, str]] = {
+        "save_intermediates": f"this system writes no files of its own; {_DEBUG}",
+        "return_intermediates": _NO_WAVEFRONTS,
+        "add_distortion": "distortion and charge diffusion are modelled by from_webbpsf only; "
+        "leave it out for OVERSAMP and DET_SAMP alone",
+    }
+
+    def calc_psf(  # type: ignore[override]  # An instrument of stpsf is no OpticalSystem of poppy.
+        self,
+        outfile: str | os.PathLike[str] | None = None,
+        source: Any = None,
+        nlambda: int | None = None,
+        monochromatic: float | None = None,
+        fov_arcsec: float | None = None,
+        fov_pixels: int | tuple[int, int] | None = None,
+        oversample: int | None = None,
+        detector_oversample: int | None = None,
+        fft_oversample: int | None = None,
+        overwrite: bool = True,
+        display: bool = False,
+        save_intermediates: bool = False,
+        return_intermediates: bool = False,
+        normalize: str = "first",
+        add_distortion: bool | None = None,
+        crop_psf: bool = True,
+        opd: Value | None = None,
+        **parameters: Value,
+    ) -> Any:
+        """PSF as an HDUList, with the arguments of `calc_psf` of stpsf's instruments.
+
+        Arguments that are not given keep the values that the system was made with.
+
+        Parameters
+        ----------
+        source : float, Quantity, (wavelengths, photons) or mapping, optional
+            Temperature (K) or spectrum of the star, or "wavelengths" (m) and "weights" of the PSF.
+        oversample, detector_oversample, fft_oversample : int, optional
+            Samples per pixel, and per lambda/D on the occulter; the first sets both.
+        outfile : path, optional
+            Write the result there.
+        display : bool
+            Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
+        normalize : str
+            "first", "last", "exit_pupil" or "none", as in poppy.
+        add_distortion : bool, optional
+            Add extensions OVERDIST and DET_DIST; default in systems of `from_webbpsf`, which alone
+            have them.
+        crop_psf : bool
+            As in stpsf; without effect where there is no distortion.
+        return_intermediates : bool
+            Also return a list of `poppy.Wavefront`, one per plane; systems of `from_webbpsf` alone
+            have them.
+        save_intermediates
+            Refused with a pointer to what does the same.
+        opd, **parameters
+            As in a call of the system.
+
+        Returns
+        -------
+        HDUList, or (HDUList, list of poppy.Wavefront)
+            Extensions OVERSAMP and DET_SAMP, and perhaps OVERDIST and DET_DIST.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a keyword of stpsf's that this system does not serve, with the reason, and for a
+            setting that it cannot change.
+        """
+        refuse_keywords(self._refused, locals())
+        require_one_sampling(oversample, detector_oversample, fft_oversample)
+        changes = self._changes(
+            {
+                "source": source,
+                "nlambda": nlambda,
+                "monochromatic": monochromatic,
+                "fov_arcsec": fov_arcsec,
+                "fov_pixels": fov_pixels,
+                "oversample": oversample,
+                "detector_oversample": detector_oversample,
+                "fft_oversample": fft_oversample,
+            }
+        )
+        system: Any = self.with_fidelity(**{k: v for k, v in changes.items() if v is not None})
+        wavefronts = None
+        if return_intermediates:
+            wavefronts = system._intermediates(normalize, opd, parameters, only_last=False)
+        options = {"add_distortion": add_distortion is not False, "crop_psf": crop_psf}
+        hdus = system._extensions(normalize, opd, parameters, options)
+        save(hdus, outfile, overwrite)
+        if display:
+            system._draw_psf(hdus, parameters)
+        return hdus if wavefronts is None else (hdus, wavefronts)
+
+    def _changes(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Arguments of `calc_psf` as settings of this system."""
+        common, source = given["oversample"], given["source"]
+        pixels, fine = given.pop("detector_oversample"), given.pop("fft_oversample")
+        given["oversample"] = common if pixels is None else pixels
+        given["occulter_sampling"] = common if fine is None else fine
+        if isinstance(source, Mapping):
+            # As stpsf: wavelengths and weights of the PSF, in place of a spectrum and a filter.
+            given["source"] = None
+            given["bandpass"] = Bandpass.of(source["wavelengths"], source["weights"])
+        return given
+
+    def _extensions(
+        self,
+        normalize: str,
+        opd: Value | None,
+        parameters: Mapping[str, Value],
+        options: Mapping[str, Any],
+    ) -> fits.HDUList:
+        """The PSF with the extensions and keywords of stpsf, for two of its `options`."""
+        sampling = self.recipe.get("occulter_sampling")
+        return instrument_psf(self, self.setup, sampling, normalize, opd, **parameters)
