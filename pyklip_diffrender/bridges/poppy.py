@@ -25,8 +25,6 @@ from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.planes import Detector, Values
 from pyklip_diffrender.optics.system import REFUSED, OpticalSystem
 
-# The fields at all planes as `poppy.Wavefront` objects.
-
 Array = NDArray[Any]
 
 
@@ -37,10 +35,10 @@ def intermediate_wavefronts(
     parameters: Mapping[str, Any],
     only_last: bool,
 ) -> list[poppy.Wavefront]:
-    """Fields as poppy's own objects, one per plane, weighted and summed as poppy does.
+    """Fields as `poppy.Wavefront`, one per plane, weighted and summed as poppy does.
 
-    For an image plane, the field behind the mask on the sampled part of the image. `normalize` must
-    be "first". With `only_last` there is the field on the detector alone.
+    The field of an image plane is the field behind the mask on the sampled part of the image.
+    `normalize` must be "first". With `only_last`, there is the field on the detector alone.
     """
     if normalize.lower() != "first":
         raise IncompatibleSetupError(
@@ -58,7 +56,7 @@ def intermediate_wavefronts(
             elif summed[k].shape == wave.shape:
                 summed[k].wavefront = summed[k].wavefront + wave.wavefront
             # Otherwise an image plane, sampled in proportion to the wavelength, has another number
-            # of samples; that of the first wavelength is kept.
+            # of samples; the field at the first wavelength is kept.
     return summed
 
 
@@ -78,7 +76,7 @@ def _wavefronts(
                 if isinstance(plane, FourierMask):
                     field = to_poppy.apply_to_lattice(field)
                 else:
-                    # On the image the inversion of y is undone.
+                    # In the image, the inversion of y is undone.
                     field = Orientation.inversion("y").then(to_poppy).apply(field)
                 wave.wavefront = _numpy(field)
             if k > 0:
@@ -104,7 +102,7 @@ def _numpy(field: Tensor) -> Array:
 def _wave_of(
     field: Tensor, wavelength: float, diameter: float, arcsec: float | None
 ) -> poppy.Wavefront:
-    """A field in a pupil, or on an image with samples of a given size."""
+    """A `poppy.Wavefront` of a field in a pupil, or in an image with samples of `arcsec`."""
     sampling = {} if arcsec is None else {"pixelscale": arcsec * u.arcsec / u.pix}
     wave = poppy.Wavefront(wavelength=wavelength * u.m, npix=1, diam=diameter * u.m, **sampling)
     wave.wavefront = _numpy(field)
@@ -114,8 +112,6 @@ def _wave_of(
         wave.fov = len(field) * arcsec * u.arcsec
     return wave
 
-
-# `from_poppy`: make a differentiable system of a poppy `OpticalSystem`, and export wavefronts.
 
 WRITTEN_BY_CALLER = (
     "this system writes no files of its own; pass return_intermediates=True and call .writeto() on "
@@ -130,10 +126,10 @@ _SUPPORTED = (
 
 
 class PoppySystem(OpticalSystem):
-    """An `OpticalSystem` made from poppy's, with its names and interface; see `Conversion`."""
+    """An `OpticalSystem` made from an `OpticalSystem` of poppy; see `Conversion`."""
 
     _source: ClassVar[str] = "osys"
-    """Argument that defines the system, as opposed to settings of it."""
+    """Argument that defines the system; all others are settings."""
     _refused: ClassVar[Mapping[str, str]] = {
         "save_intermediates": WRITTEN_BY_CALLER,
         "display_intermediates": "display=True draws the PSF alone; pass return_intermediates=True "
@@ -167,7 +163,7 @@ class PoppySystem(OpticalSystem):
     def adjustable(self) -> frozenset[str]:
         """See `OpticalSystem.adjustable`.
 
-        Without "occulter_sampling" if a mask depends on poppy's own sampling of the image
+        "occulter_sampling" is missing if a mask depends on poppy's sampling of the image
         (four-quadrant masks).
         """
         return frozenset({*self.recipe, "bandpass"} - {self._source, *self._fixed})
@@ -207,33 +203,33 @@ def from_poppy(
 ) -> PoppySystem:
     """Make a differentiable system of a poppy `OpticalSystem`.
 
-    ``model()`` is the image that ``osys.calc_psf`` gives, binned to detector pixels; ``model(opd)``
-    replaces the OPD of the first plane, in that plane's own frame; ``model.entrance.opd`` is the
-    one it has. Source offsets of `osys` are kept, and `star_offset` adds to them.
+    ``model()`` is the image of ``osys.calc_psf``, binned to detector pixels. ``model(opd)`` has
+    another OPD of the first plane, in the frame of that plane, than ``model.entrance.opd``. Source
+    offsets of `osys` are kept; `star_offset` is added.
 
     The result can be passed to `refine` and `detect` like any other system.
 
     Parameters
     ----------
     osys : poppy.OpticalSystem
-        Fraunhofer system of pupil, image and detector planes. It is not changed, and later
-        changes to it do not reach the model.
+        Fraunhofer system of pupil, image and detector planes. The conversion does not change the
+        system, and later changes of the system do not affect the model.
     wavelength : Quantity, float (m) or sequence of them
         Wavelengths at which the optics are evaluated.
     weights : sequence of float, optional
         One per wavelength; default equal.
     propagation : "auto", "compact", "fft", or mapping of plane name to one of these
-        How to pass image planes. "compact" evaluates a mask only where it blocks light, which
-        must be a bounded part of the image; "fft" uses FFTs padded as poppy's. "auto" takes
-        "compact" where that is possible; ``model.propagation`` records the choice.
+        Propagation through image planes. "compact" evaluates a mask only where light is blocked,
+        which must be a bounded part of the image; "fft" uses FFTs padded as in poppy. "auto" is
+        "compact" where possible; ``model.propagation`` records the choice.
     occulter_sampling : float, optional
-        Samples per lambda/D in image planes; default ``osys.oversample``, with which the model
-        and poppy agree to rounding either way. FFTs are padded by the next whole number.
+        Samples per lambda/D in image planes. With the default, ``osys.oversample``, the model and
+        poppy agree to rounding with either propagation. FFTs are padded by the next whole number.
     npix : int, optional
-        Samples across the pupil, a divisor of poppy's number: the sampled planes are averaged
-        over blocks. Default poppy's own.
+        Samples across the pupil, a divisor of the number in poppy, which is the default: sampled
+        planes are averaged over blocks.
     fov_pixels : int or (ny, nx), optional
-        Detector pixels; default those of the system's detector.
+        Detector pixels; default as in the system's detector.
     dtype : torch.dtype
         torch.float64 or torch.float32.
     device : str or torch.device
@@ -266,7 +262,7 @@ def from_poppy(
 
 
 def _from_private(**recipe: Any) -> PoppySystem:
-    """As `from_poppy`, for a system that is not shared with the caller."""
+    """A system as by `from_poppy`, from an `osys` that is not shared with the caller."""
     return PoppySystem(Conversion(recipe["osys"], recipe), recipe, _from_private)
 
 
@@ -276,8 +272,8 @@ def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:
     Parameters
     ----------
     opd : Tensor, Quantity or array, (n, n)
-        m, frame of the first plane; for example a refined wavefront. It is resampled to the pixels
-        of that plane.
+        OPD in m, in the frame of the first plane; for example a refined wavefront. The map is
+        resampled to the pixels of that plane.
     osys : poppy.OpticalSystem
         Not changed.
 
@@ -315,8 +311,8 @@ def check_supported(osys: Any) -> None:
         )
     if type(osys).propagate is not poppy.OpticalSystem.propagate:
         raise IncompatibleSetupError(
-            f"{osys.name}: a {type(osys).__name__} propagates, or samples its image planes, in a "
-            "way of its own; convert the poppy.OpticalSystem that it was made from"
+            f"{osys.name}: a {type(osys).__name__} does not propagate, or sample image planes, as "
+            "a poppy.OpticalSystem does; convert the poppy.OpticalSystem from which it was made"
         )
     planes = list(osys.planes)
     if not planes or planes[0].planetype != PlaneType.pupil:
@@ -346,8 +342,8 @@ def check_supported(osys: Any) -> None:
         if turning and previous.planetype == PlaneType.image:
             raise IncompatibleSetupError(
                 f"plane {plane.name!r} turns the field in the image plane {previous.name!r}, "
-                "where poppy moves it by one sample as well. Put it in front of that plane, "
-                "or behind the next pupil"
+                "where poppy moves the field by one sample as well. Put the turn in front of that "
+                "plane, or behind the next pupil"
             )
         previous = plane
     if previous.planetype == PlaneType.image:

@@ -26,8 +26,6 @@ from pyklip_diffrender.optics.planes import (
 )
 from pyklip_diffrender.parameters import parameter
 
-# Threads of torch in processes that are made by a fork.
-
 _registered = False
 
 
@@ -43,25 +41,23 @@ def one_thread_after_fork() -> None:
         _registered = True
 
 
-# How many arrays to compute at a time.
+_CPU_ARRAY_BYTES = 3e6
+"""Bytes of an array of a batch on the CPU. Arrays of three times the size may take twice as long:
+the C library returns the memory to the operating system, which has to clear it for the next."""
 
-_CPU_BYTES = 3e6
-"""Bytes of one array of a batch on the CPU. Batches of three times the size may take twice as long:
-the C library returns their memory to the operating system, which has to clear it for the next."""
-
-_GPU_BYTES = 1e8
-"""Bytes of one array of a batch on an accelerator, which needs many arrays at a time to be busy;
-not measured."""
+_GPU_ARRAY_BYTES = 1e8
+"""Bytes of an array of a batch on an accelerator, which is busy only with many arrays at a time.
+The number was not measured."""
 
 
 def batch_of(size: int, dtype: torch.dtype, device: torch.device) -> int:
     """Return how many arrays of `size` elements to compute at a time, at least 1."""
-    available = _CPU_BYTES if device.type == "cpu" else _GPU_BYTES
+    available = _CPU_ARRAY_BYTES if device.type == "cpu" else _GPU_ARRAY_BYTES
     return max(1, int(available / (size * dtype.itemsize)))
 
 
-# At every wavelength the entrance pupil converts the OPD to a field, the planes propagate it
-# linearly, and the detector samples it. The image is the weighted sum of the intensities.
+# At every wavelength the entrance pupil converts the OPD to a field, the planes propagate this
+# field linearly, and the detector samples it. The image is the weighted sum of the intensities.
 
 Value = Tensor | ArrayLike | float
 
@@ -153,15 +149,14 @@ class Propagation:
         return tuple(name for plane in self.planes for name in plane.parameters)
 
     def opd(self, opd: Value | None) -> Tensor:
-        """Check an OPD and bring it to the system's device: (..., npix, npix) in m.
+        """An OPD on the system's device, checked: (..., npix, npix) in m.
 
         Arrays, Quantities and maps with another number of pixels across the pupil are resampled,
         see `grid.resample`. Tensors keep their values, so that gradients flow, and must have the
-        system's own size. None stands for the system's own wavefront, which is flat unless it was
-        made with one. ShapeError for a map that is not square or a tensor of another size,
+        size of the system's pupil. None stands for the wavefront with which the system was made,
+        otherwise a flat one. ShapeError for a map that is not square or a tensor of another size,
         UnitError for a Quantity that is not a length, NonFiniteError for values that are not
-        finite; a warning for an array whose rms inside the pupil is that of a wavefront in another
-        unit.
+        finite; a warning for an array whose rms inside the pupil suggests another unit.
         """
         if opd is None and self.entrance.opd is not None:
             return self.entrance.opd
@@ -188,11 +183,11 @@ class Propagation:
         return torch.from_numpy(array).to(self.device)
 
     def values(self, parameters: Mapping[str, Value | None]) -> dict[str, Tensor]:
-        """Check named parameter values and make them float64 tensors, (components,) each.
+        """Values of named parameters, checked, as float64 tensors, (components,) each.
 
-        Quantities are converted to the unit of the parameter table (UnitError if they are of
-        another kind). Parameters that are missing or None get the system's `defaults`, if it has
-        them. TypeError for a name that this system does not take, ShapeError for a wrong number of
+        Quantities are converted to the unit of the parameter table (UnitError for a Quantity of
+        another kind). Parameters that are missing or None have the values in `defaults`, if any.
+        TypeError for a name that this system does not take, ShapeError for a wrong number of
         components.
         """
         checked = dict(self.defaults)
@@ -218,12 +213,12 @@ class Propagation:
         return self.entrance.field(opd, wavelength, values.get("star_offset"))
 
     def windows(self, values: Values) -> list[PupilGrid]:
-        """For every plane, the pupil window that it must pass on, given the planes behind it."""
+        """Pupil windows that the planes must pass on to the planes behind them, in order."""
         needed = self.entrance.full
         passed: list[PupilGrid] = []
         for plane in reversed(self.between):
             passed.append(needed)
-            # A mask acts on all the light in front of it, not only on what is needed behind.
+            # A mask acts on all the light in front of it, not only on the light needed behind.
             needed = plane.window(values) or (self.entrance.full if plane.focal else needed)
         return passed[::-1]
 
@@ -240,10 +235,10 @@ class Propagation:
         return wavefront
 
     def plane_waves(self, wavefront: Wavefront, values: Values, reach: int) -> PlaneWaves | None:
-        """Prepare the propagation of a field behind the entrance pupil times plane waves.
+        """Propagation of a field behind the entrance pupil times plane waves.
 
-        Waves have up to `reach` cycles across the pupil array along an axis. None where that is not
-        faster than `propagate`.
+        Waves have up to `reach` cycles across the pupil array along an axis. None where `propagate`
+        is as fast.
         """
         if self._lattice is None:
             return None
@@ -265,8 +260,8 @@ class Propagation:
     def behind_occulter(self, wavefront: Wavefront, values: Values) -> Wavefront:
         """Propagate from behind the entrance pupil to the pupil behind the last occulter.
 
-        Together with `to_detector` this is `propagate`. It is slower, but what it returns does not
-        depend on `parameters_behind`.
+        This and `to_detector` make `propagate` in two steps, which are slower; the wavefront in
+        between does not depend on `parameters_behind`.
         """
         windows = self.windows(values)
         if self._lattice is not None:
@@ -276,7 +271,7 @@ class Propagation:
         return wavefront
 
     def to_detector(self, wavefront: Wavefront, values: Values) -> Tensor:
-        """Field on the detector's samples from that in the pupil behind the last occulter."""
+        """Field on the detector's samples from the field in the pupil behind the last occulter."""
         first = self._last_occulter
         for plane, onto in zip(self.between[first:], self.windows(values)[first:], strict=True):
             wavefront = plane.apply(wavefront, values, onto)
@@ -285,7 +280,8 @@ class Propagation:
     def transmission(self, opd: Value | None = None, **parameters: Value) -> float:
         """Fraction of the collected light of a source far from the occulter that is detected.
 
-        It is that of the planes in pupils, such as the Lyot stop, at the mean wavelength.
+        Only planes in pupils, such as the Lyot stop, absorb light of such a source. The fraction is
+        for the mean wavelength.
         """
         open_path = copy.copy(self)
         open_path.between = tuple(each for each in self.between if not each.focal)
@@ -310,7 +306,8 @@ class Propagation:
     ) -> Tensor:
         """Image (..., ny, nx) from the `fields` at all wavelengths.
 
-        Of the `values` only the detector's matter; `weights` (wavelengths,) replace the bandpass's.
+        Of the `values`, only the parameters of the detector matter. `weights` (wavelengths,)
+        replace the weights of the bandpass.
         """
         spectrum = self.bandpass.weights if weights is None else weights
         intensity = torch.zeros((), dtype=self.dtype, device=self.device)
@@ -351,11 +348,11 @@ class Propagation:
     def debug(
         self, opd: Value | None = None, wavelength: float | None = None, **parameters: Value
     ) -> dict[str, Tensor]:
-        """The field at every named plane, in order.
+        """The field at every plane, by the plane's name, in order.
 
-        Pupil planes: the field behind the plane on its window of the pupil. Occulters: the field in
-        front of the mask, on its cells ("... focus"), then the field back in the pupil. The
-        detector: the field on its samples.
+        Pupil planes have the field behind the plane, on the plane's window of the pupil. Occulters
+        have the field in front of the mask, on the cells of the mask ("... focus"), and the field
+        in the next pupil. The detector has the field on its samples.
         """
         tensor, values = self.opd(opd), self.values(parameters)
         wavelength = wavelength or self.bandpass.wavelengths[0]

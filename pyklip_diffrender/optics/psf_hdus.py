@@ -1,4 +1,4 @@
-"""PSFs in the form that poppy and stpsf give them: HDULists with their extensions and keywords."""
+"""PSFs as HDULists with the extensions and keywords of poppy and stpsf."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _NORMALIZATIONS = ("first", "last", "exit_pupil", "none")
 def _samples(system: Propagation, normalize: str, opd: Any, parameters: dict[str, Any]) -> Array:
     """Light on the detector's samples, before binning, (oversample ny, oversample nx).
 
-    `normalize` says what adds up to 1 at every wavelength: the light behind the "first" plane, on
-    the "last", or in the "exit_pupil"; with "none" the field is 1 where the pupil is clear.
+    `normalize` names the plane where the light adds up to 1 at every wavelength: "first", "last" or
+    "exit_pupil". With "none" the field is 1 where the pupil is clear.
     """
     kind = normalize.lower()
     if kind not in _NORMALIZATIONS:
@@ -69,7 +69,7 @@ def _exit_light(
 
 
 def _propagations(system: Propagation) -> str:
-    """For systems made from poppy's, how each image plane is passed."""
+    """How a system that was made from poppy's propagates through each image plane."""
     used = getattr(system, "propagation", None) or {}
     return ", ".join(f"{name}: {kind}" for name, kind in used.items()) or "compact"
 
@@ -132,8 +132,8 @@ def instrument_psf(
 ) -> fits.HDUList:
     """The return value of `poppy.Instrument.calc_psf`: extensions OVERSAMP (samples) and DET_SAMP.
 
-    `setup` is `OpticalSystem.setup`, `sampling` the cells per lambda/D on the occulter, for the
-    header; see `_samples` for `normalize`.
+    `setup` is `OpticalSystem.setup`, `sampling` the number of cells per lambda/D on the occulter,
+    for the header; see `_samples` for `normalize`.
     """
     factor = system.detector.oversample
     primary = fits.PrimaryHDU(_samples(system, normalize, opd, parameters))
@@ -169,7 +169,7 @@ _SETUP_KEYWORDS = {
 
 
 def refuse_keywords(reasons: Mapping[str, str], given: Mapping[str, Any]) -> None:
-    """Raise for keywords of poppy's or stpsf's that are set and that a system cannot serve."""
+    """Raise IncompatibleSetupError for a keyword of poppy or stpsf that a system cannot serve."""
     for name, reason in reasons.items():
         # An input wavefront is an array of numbers, without a truth value.
         if given[name] is not None and given[name] is not False:
@@ -177,7 +177,7 @@ def refuse_keywords(reasons: Mapping[str, str], given: Mapping[str, Any]) -> Non
 
 
 def require_one_sampling(common: int | None, detector: int | None, fft: int | None) -> None:
-    """Raise if the oversampling of detector and image planes is given twice, as stpsf does."""
+    """Raise IncompatibleSetupError, as stpsf does, if an oversampling is given twice."""
     if None not in (common, detector, fft):
         raise IncompatibleSetupError(
             "give oversample, or detector_oversample with fft_oversample, not all three"
@@ -185,7 +185,7 @@ def require_one_sampling(common: int | None, detector: int | None, fft: int | No
 
 
 def save(hdus: fits.HDUList, outfile: str | os.PathLike[str] | None, overwrite: bool) -> None:
-    """Write a PSF, unless `outfile` is None; ExistingFileError if it must not be replaced."""
+    """Write a PSF, unless `outfile` is None; ExistingFileError unless `overwrite` is True."""
     if outfile is None:
         return
     require_new([outfile], overwrite)

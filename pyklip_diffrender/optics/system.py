@@ -45,7 +45,7 @@ _BAND = ("monochromatic", "nlambda", "source", "wavelength")
 
 
 class OpticalSystem(Propagation):
-    """A coronagraph: entrance pupil, the planes behind it, detector.
+    """A coronagraph: the entrance pupil, the planes behind it and the detector.
 
     Call it with an OPD to get the image of a star; everything is differentiable in torch.
 
@@ -58,17 +58,17 @@ class OpticalSystem(Propagation):
     bandpass : Bandpass
         Wavelengths and weights.
     recipe : mapping, optional
-        The arguments that the system was made with, for provenance and for `with_fidelity`.
+        Arguments with which the system was made, for provenance and for `with_fidelity`.
     remake : callable, optional
-        Makes another system from the arguments in `recipe`, some of them changed.
+        Function that makes another system from the arguments in `recipe`, some of them changed.
     route : "auto", "lattice" or "planes"
-        How light gets to the detector: by a convolution on cells that fit the detector, which
-        needs a single compact occulter between pupils, or plane by plane, which always works.
-        "auto" takes the first if possible, unless the detector is very fine.
+        Propagation to the detector: by a convolution on cells that fit the detector ("lattice"),
+        which needs a single compact occulter between pupils, or plane by plane ("planes"), which
+        always works. "auto" is "lattice" if possible, unless the detector is very fine.
     defaults : mapping of str to value, optional
-        Values of named parameters for calls that do not give them, in the units of the parameter
-        table: the alignment of the instrument, or the result of an earlier fit. Not
-        ``star_offset``, which belongs to a source and not to the instrument.
+        Values of parameters, by name, for calls without these parameters, in the units of the
+        parameter table: the alignment of the instrument, or the result of an earlier fit. A
+        ``star_offset``, which belongs to a source and not to the instrument, is not allowed.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class OpticalSystem(Propagation):
         "nlambda": ("monochromatic",),
         "source": ("monochromatic",),
     }
-    """For a setting, the alternatives to it, which are dropped when it is given."""
+    """Alternatives to a setting, which are dropped when the setting is given."""
 
     def __init__(
         self,
@@ -133,9 +133,9 @@ class OpticalSystem(Propagation):
 
     @property
     def setup(self) -> dict[str, str]:
-        """The instrument setup that the system models; empty if it is not an instrument.
+        """Setup of the instrument; empty if the system is not an instrument.
 
-        Names in the spelling of stpsf under "filter", "image_mask", "pupil_mask" and "module".
+        The keys "filter", "image_mask", "pupil_mask" and "module" have names as stpsf spells them.
         """
         names = ("filter", "image_mask", "pupil_mask", "module")
         return {name: self.recipe[name] for name in names if self.recipe.get(name)}
@@ -144,10 +144,10 @@ class OpticalSystem(Propagation):
     def adjustable(self) -> frozenset[str]:
         """Names of the settings that `with_fidelity` can change.
 
-        "npix", "dtype", "occulter_sampling", "fov_pixels" and "bandpass" (a `Bandpass`) have the
-        same names in all systems that can change them. The other names are arguments of the
-        function that made the system. A system made directly from planes can only change its
-        bandpass, and not even that if its planes were sampled at certain wavelengths.
+        "npix", "dtype", "occulter_sampling", "fov_pixels" and "bandpass" (a `Bandpass`) have these
+        names in all systems where they can be changed. The other names are arguments of the
+        function that made the system. Of a system made directly from planes, only the bandpass can
+        be changed, unless the planes were sampled at certain wavelengths.
         """
         names = set(self.recipe) if self.maker is not None else set()
         return frozenset(names if self._is_sampled else {*names, "bandpass"})
@@ -159,8 +159,8 @@ class OpticalSystem(Propagation):
         ----------
         **changes
             Settings in `adjustable`. Alternatives are dropped: ``fov_pixels`` replaces
-            ``fov_arcsec``, ``nlambda`` replaces ``monochromatic``. A setting that keeps its value
-            is always accepted.
+            ``fov_arcsec``, ``nlambda`` replaces ``monochromatic``. A setting with an unchanged
+            value is always accepted.
 
         Raises
         ------
@@ -174,9 +174,9 @@ class OpticalSystem(Propagation):
         ]
         if refused:
             raise IncompatibleSetupError(
-                f"{', '.join(refused)}: {self!r} cannot change that; it can change "
-                f"{', '.join(sorted(self.adjustable)) or 'nothing'}. Make a second system with "
-                "the settings you want"
+                f"{', '.join(refused)}: cannot be changed in {self!r}. Settings that can be "
+                f"changed are {', '.join(sorted(self.adjustable)) or 'none'}. Make a second system "
+                "with the settings you want"
             )
         changes = {name: value for name, value in changes.items() if name in self.adjustable}
         bandpass = changes.pop("bandpass", None)
@@ -188,14 +188,14 @@ class OpticalSystem(Propagation):
     def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
         """Return a copy of the system with another bandpass.
 
-        The planes and their cached results are shared. `with_fidelity` of the result keeps the
-        bandpass.
+        Both systems share the planes and the cached results of the planes. `with_fidelity` of the
+        copy keeps the bandpass.
 
         Parameters
         ----------
         bandpass : Bandpass
             Any wavelengths if "bandpass" is in `adjustable`, otherwise a selection of the
-            system's own.
+            wavelengths of this system.
 
         Raises
         ------
@@ -359,13 +359,12 @@ class OpticalSystem(Propagation):
     def plot(self, ax: Any = None, *, opd: Value | None = None) -> NDArray[Any]:
         """Draw the entrance pupil, the wavefront error, the light in the last pupil and the image.
 
-        The light in the last pupil and the image are those of a star on the optical axis, in
-        logarithmic scale.
+        The last two are for a star on the optical axis, on a logarithmic scale.
 
         Parameters
         ----------
         ax : four Axes, optional
-            Default those of a new figure.
+            By default, the axes of a new figure.
         opd : Tensor, Quantity or array, (npix, npix), optional
             As in a call of the system.
 
@@ -443,7 +442,7 @@ class InstrumentSystem(OpticalSystem):
         source : float, Quantity, (wavelengths, photons) or mapping, optional
             Temperature (K) or spectrum of the star, or "wavelengths" (m) and "weights" of the PSF.
         oversample, detector_oversample, fft_oversample : int, optional
-            Samples per pixel, and per lambda/D on the occulter; the first sets both.
+            Samples per pixel, and per lambda/D on the occulter; `oversample` sets both.
         outfile : path, optional
             Write the result there.
         display : bool
@@ -471,8 +470,8 @@ class InstrumentSystem(OpticalSystem):
         Raises
         ------
         IncompatibleSetupError
-            For a keyword of stpsf's that this system does not serve, with the reason, and for a
-            setting that it cannot change.
+            For a keyword of stpsf that this system does not serve, with the reason, and for a
+            setting that cannot be changed.
         """
         refuse_keywords(self._refused, locals())
         require_one_sampling(oversample, detector_oversample, fft_oversample)
