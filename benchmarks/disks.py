@@ -13,7 +13,6 @@ which has none, and prints how much of that known light each keeps.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
+from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.drawing import compass, halo, light_norm, save
 from pyklip_diffrender.reduction.klip import KlipSubtraction, klip_curve
@@ -90,10 +90,7 @@ def draw(reduction: dr.Reduction, subtracted: Image, path: Path) -> None:
 
 def main() -> None:
     """Reduce AU Mic, and HIP 17695 with its disk."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
-    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
-    parser.add_argument("--filter", default="F444W")
+    parser = real_frames_parser(__doc__, target=None)
     parser.add_argument("--figure", type=Path)
     options = parser.parse_args()
 

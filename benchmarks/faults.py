@@ -1,13 +1,9 @@
 """Surveys under fire: processes killed at random, disks that are full, files that are damaged.
 
-Run from the root of the project::
-
-    python -m benchmarks.faults --seeds 20 --mutations 1000
-
 Every scenario runs a survey of cheap jobs as real processes, breaks something, and requires that
-no folder is half a product, that finished jobs are kept, and that there is a message. It prints
-how often each was tried, and ends with an error at the first requirement that does not hold.
-Scenarios that need a mounted disk are skipped where mounting is not allowed.
+no folder is half a product, that finished jobs are kept, and that there is a message. The tests of
+surveys run the scenarios. Scenarios that need a mounted disk raise PermissionError where mounting
+is not allowed.
 """
 
 from __future__ import annotations
@@ -18,11 +14,9 @@ import json
 import os
 import random
 import resource
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -444,37 +438,14 @@ def damaged_inputs(folder: Path, _: int, count: int) -> str:
     return mutations.run(folder, count)
 
 
-SCENARIOS = (
-    workers_killed, client_killed, two_surveys, read_only, full_disk, file_limit, out_of_memory,
-    scheduler_killed, blind_worker, damaged_inputs,
-)  # fmt: skip
-
-
 def main() -> int:
-    """Run the scenarios, or a survey for one of them."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=20, help="of the scenarios that kill")
-    parser.add_argument("--mutations", type=int, default=1000, help="of the damaged inputs")
-    names = [each.__name__ for each in SCENARIOS]
-    parser.add_argument("--only", choices=names, nargs="+", default=names)
-    parser.add_argument("--client", nargs=2, help=argparse.SUPPRESS)
-    parser.add_argument("--work", choices=list(WORK), default="slow", help=argparse.SUPPRESS)
-    parser.add_argument("--scheduler", help=argparse.SUPPRESS)
+    """Run the survey of a scenario, in a process that the scenario may kill."""
+    parser = argparse.ArgumentParser(description="A survey of a scenario")
+    parser.add_argument("--client", nargs=2, required=True)
+    parser.add_argument("--work", choices=list(WORK), default="slow")
+    parser.add_argument("--scheduler")
     options = parser.parse_args()
-    if options.client:
-        return run_client(*options.client, options.work, options.scheduler)
-    for scenario in SCENARIOS:
-        if scenario.__name__ not in options.only:
-            continue
-        folder = Path(tempfile.mkdtemp(prefix=scenario.__name__))
-        try:
-            said = scenario(folder, options.seeds, options.mutations)
-        except PermissionError as error:
-            said = f"skipped: {error}"
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-        print(f"{scenario.__name__}: {said}", flush=True)
-    return 0
+    return run_client(*options.client, options.work, options.scheduler)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ whose image has the measured wavefront. It prints what `forward_model` prints.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import tempfile
@@ -30,6 +29,7 @@ from pyklip.instruments.JWST import JWSTData
 
 import pyklip_diffrender as dr
 from benchmarks.forward_model import STAMP, Errors, Image, Planet, print_statistics
+from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.refinement import FrameFit
 
 SIDE = 101
@@ -158,11 +158,7 @@ def measured(frames: Frames, planet: Planet, mode: str, algorithm: str | None) -
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trials and print a table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
-    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
-    parser.add_argument("--target", default="HIP17695")
-    parser.add_argument("--filter", default="F444W")
+    parser = real_frames_parser(__doc__, target="HIP17695")
     parser.add_argument("--trials", type=int, default=8)
     options = parser.parse_args(arguments)
     frames = Frames(options.frames, options.opd, options.target, options.filter)

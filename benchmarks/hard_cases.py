@@ -53,7 +53,7 @@ def system(dtype, wavelength=WAVELENGTH):
     if wavelength == WAVELENGTH:
         return model
     band = Bandpass((wavelength,), (1.0,))
-    return OpticalSystem(model.entrance, model.planes, model.detector, band)
+    return OpticalSystem(model.entrance, model.between, model.detector, band)
 
 
 @lru_cache(maxsize=8)

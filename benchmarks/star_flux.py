@@ -12,13 +12,12 @@ several values. It prints chi-squared and what is measured of the candidates.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 import pyklip_diffrender as dr
+from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.refinement import jansky_per_unit, with_star_flux
 
 SHARES = (1.0, 0.9, 1.1, 1.2)
@@ -26,11 +25,7 @@ SHARES = (1.0, 0.9, 1.1, 1.2)
 
 def main() -> None:
     """Fit with several fluxes."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
-    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
-    parser.add_argument("--target")
-    parser.add_argument("--filter")
+    parser = real_frames_parser(__doc__, target=None, band=None)
     options = parser.parse_args()
     sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
     first = dr.reduce(replace(sequence, references=()), options.opd).fit

@@ -1,4 +1,4 @@
-"""Every keyword of `calc_psf` of poppy and stpsf acts as there, or is refused with the reason."""
+"""What poppy and stpsf document acts as there, or is refused with the reason."""
 
 import inspect
 
@@ -13,9 +13,9 @@ from benchmarks import stpsf_data
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf
 from pyklip_diffrender.bridges.poppy import PoppySystem
 from pyklip_diffrender.bridges.webbpsf import WebbSystem
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.optics import InstrumentSystem, OpticalSystem
 
 # Of poppy's drawing, and of stpsf's writing.
 pytestmark = [
@@ -68,6 +68,14 @@ STPSF = {
 """Arguments of a call in which a keyword of stpsf's `Instrument.calc_psf` acts."""
 
 STPSF_REFUSED = {"save_intermediates": POPPY_REFUSED["save_intermediates"]}
+PLAIN_REFUSED = {
+    "save_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
+    "return_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
+    "return_final": (True, r"debug\(opd\) returns the field at every plane"),
+    "display_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
+    "progressbar": POPPY_REFUSED["progressbar"],
+    "inwave": POPPY_REFUSED["inwave"],
+}
 OWN_REFUSED = {
     "save_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
     "return_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
@@ -102,20 +110,20 @@ def poppy_system():
 def test_every_keyword_has_a_case():
     """In the order of the original, so that arguments may be given by position as well."""
     stpsf = pytest.importorskip("stpsf")
-    ours, theirs = keywords(PoppySystem.calc_psf), keywords(poppy.OpticalSystem.calc_psf)
-    assert list(ours)[: len(theirs)] == list(theirs)
-    assert POPPY.keys() | POPPY_REFUSED.keys() == theirs.keys() - {"self"}
-    # Without a wavelength, poppy takes 1 micron, and a converted system its own.
-    assert {n for n, default in theirs.items() if ours[n] != default} == {"wavelength"}
-    theirs = keywords(stpsf.NIRCam.calc_psf)
-    assert STPSF.keys() | STPSF_REFUSED.keys() == theirs.keys() - {"self"}
-    ours = keywords(WebbSystem.calc_psf)
-    assert list(ours)[: len(theirs)] == list(theirs)
-    assert {n for n, default in theirs.items() if ours[n] != default} == set()
-    ours = keywords(OpticalSystem.calc_psf)
-    assert list(ours)[: len(theirs)] == list(theirs)
-    # The embedded instrument has no distortion.
-    assert {n for n, default in theirs.items() if ours[n] != default} == {"add_distortion"}
+    # Without a wavelength, poppy takes 1 micron, and a system its own. The embedded instrument has
+    # no distortion, and a converted one adds it by default, as stpsf does.
+    for original, systems, cases, other in (
+        (poppy.OpticalSystem, (OpticalSystem, PoppySystem), POPPY | POPPY_REFUSED, "wavelength"),
+        (
+            stpsf.NIRCam, (InstrumentSystem, WebbSystem), STPSF | STPSF_REFUSED, "add_distortion",
+        ),
+    ):  # fmt: skip
+        theirs = keywords(original.calc_psf)
+        assert cases.keys() == theirs.keys() - {"self"}
+        for system in systems:
+            ours = keywords(system.calc_psf)
+            assert list(ours)[: len(theirs)] == list(theirs)
+            assert {n for n, default in theirs.items() if ours[n] != default} == {other}
 
 
 def same(ours, theirs, tolerance):
@@ -255,11 +263,117 @@ def embedded(_):
     return nircam_coronagraph("F444W", **EMBEDDED)
 
 
+def plain(_):
+    """A system made of planes, without a recipe."""
+    model = nircam_coronagraph("F444W", chromatic_reference=4.5e-6, **EMBEDDED)
+    return OpticalSystem(model.entrance, model.between, model.detector, model.bandpass)
+
+
 def converted(system):
     return from_poppy(system, 4.5e-6)
 
 
+@pytest.mark.parametrize("keyword", POPPY.keys() - PLAIN_REFUSED.keys())
+def test_keywords_of_poppy_act_on_a_system_made_of_planes(keyword):
+    call = {"wavelength": 4.5e-6, **POPPY[keyword]}
+    source = call.get("source", SOURCE | {"wavelengths": WAVES})
+    if keyword not in ("source", "weight"):
+        wave = u.Quantity(call["wavelength"], u.m).value
+        source = {"wavelengths": [wave], "weights": [1.0]}
+    model = nircam_coronagraph("F444W", chromatic_reference=4.5e-6, **EMBEDDED)
+    normalize = call.get("normalize", "first")
+    same(plain(None).calc_psf(**call), model.calc_psf(source=source, normalize=normalize)[:1], 0)
+    assert len(pyplot.get_fignums()) == (keyword == "display")
+
+
+def test_weights_alone_are_those_of_the_systems_wavelengths(poppy_system):
+    model = from_poppy(poppy_system, WAVES)
+    theirs = poppy_system.calc_psf(WAVES * u.m, weight=[1.0, 3.0])
+    same(model.calc_psf(weight=[1.0, 3.0]), theirs, 1e-12)
+    with pytest.raises(ShapeError, match="2 wavelengths and 3 weights"):
+        model.calc_psf(weight=[1.0, 3.0, 1.0])
+
+
+def test_intermediate_wavefronts_are_those_of_the_call(poppy_system):
+    """The wavefronts have the OPD and the place of the source that the PSF has."""
+    model = from_poppy(poppy_system, 4.5e-6)
+    opd = 1e-7 * np.random.default_rng(1).standard_normal((64, 64))
+    psf, (last,) = model.calc_psf(opd=opd, star_offset=(0.1, 0.2), return_final=True)
+    assert np.allclose(last.intensity, psf[0].data, rtol=1e-12)
+
+
+DISPLAY = {
+    "what": "both", "crosshairs": True, "ax": None, "colorbar": False,
+    "colorbar_orientation": "vertical", "title": "coronagraph", "opd_vmax": 1e-7 * u.m,
+    "wavelength": 2e-6 * u.m, "npix": 64, "grid_size": 3,
+}  # fmt: skip
+"""Keywords of `display` of poppy's optics, which `OpticalSystem.display` passes on."""
+
+
+@pytest.mark.parametrize("keyword", DISPLAY)
+def test_display_draws_what_poppy_draws(poppy_system, keyword):
+    placed = {"self", "nrows", "row"}  # By the system, in which an optic has a row.
+    assert DISPLAY.keys() == keywords(poppy.poppy_core.OpticalElement.display).keys() - placed
+    call = {"what": "both", keyword: DISPLAY[keyword]}
+    poppy_system.display(**call)
+    theirs = pyplot.gcf()
+    pyplot.figure()
+    converted(poppy_system).display(**call)
+    ours = pyplot.gcf()
+    assert ours is not theirs
+    assert len(ours.axes) == len(theirs.axes) >= 6
+    for mine, other in zip(ours.axes, theirs.axes, strict=True):
+        assert mine.get_title() == other.get_title()
+        assert len(mine.lines) == len(other.lines)
+        for image, wanted in zip(mine.images, other.images, strict=True):
+            assert np.array_equal(image.get_array(), wanted.get_array(), equal_nan=True)
+            assert image.get_clim() == wanted.get_clim()
+            assert image.get_extent() == wanted.get_extent()
+    with pytest.raises(IncompatibleSetupError, match=rf"^{keyword}=.*plot\(ax, opd"):
+        embedded(None).display(**call if keyword == "what" else {keyword: DISPLAY[keyword]})
+
+
+@pytest.mark.slow
+def test_display_of_an_instrument(stpsf_path):
+    instrument = stpsf_data.nircam(stpsf_path)
+    assert list(keywords(type(instrument).display)) == ["self"]
+    instrument.display()
+    theirs = [ax.get_title() for ax in pyplot.gcf().axes]
+    pyplot.figure()
+    from_webbpsf(instrument, **FAST).display()
+    assert [ax.get_title() for ax in pyplot.gcf().axes] == theirs
+    assert "MASK335R" in "".join(theirs)
+
+
+def test_display_of_the_embedded_instrument():
+    embedded(None).display()
+    # The pupil, the wavefront, the light in the last pupil and the image.
+    assert len(pyplot.gcf().axes) == 4
+
+
+def test_planes_from_pupil_to_detector_are_described(poppy_system):
+    model = converted(poppy_system)
+    assert [plane.name for plane in model.planes] == [each.name for each in poppy_system.planes]
+    for system in (model, embedded(None)):
+        assert system.planes == (system.entrance, *system.between, system.detector)
+        first, *lines = system.describe().split("\n\t")
+        assert first == repr(system)
+        assert len(lines) == len(system.planes)
+        for line, plane in zip(lines, system.planes, strict=True):
+            assert line == repr(plane)
+            assert plane.name in line
+        assert "object at 0x" not in system.describe()
+    assert embedded(None).describe().split("\n\t")[1:] == [
+        "<EntrancePupil 'JWST pupil', 64 px pupil>",
+        "<CompactOcculter 'MASK335R', image plane>",
+        "<LyotStop 'MASKRND', pupil plane>",
+        "<InternalAberration 'NIRCam internal WFE', pupil plane>",
+        "<Detector 'detector', 20 x 20 px of 0.06242 arcsec>",
+    ]
+
+
 CASES = [
+    *((plain, name, *case) for name, case in PLAIN_REFUSED.items()),
     *((converted, name, *case) for name, case in POPPY_REFUSED.items()),
     *((embedded, name, *case) for name, case in OWN_REFUSED.items()),
 ]

@@ -276,16 +276,16 @@ REFUSED = {
     r"'stop' \(SecondaryObscuration.*not supported. Supported are": (
         lambda: changed(2, planetype=PlaneType.intermediate)
     ),
-    "convert the poppy.OpticalSystem that it was made from": (
+    "convert the poppy.OpticalSystem from which it was made": (
         lambda: poppy.MatrixFTCoronagraph(make(PUPIL, SPOT, STOP))
     ),
-    "SemiAnalyticCoronagraph propagates.*convert the poppy.OpticalSystem": (
+    "SemiAnalyticCoronagraph does not propagate.*convert the poppy.OpticalSystem": (
         lambda: poppy.SemiAnalyticCoronagraph(make(PUPIL, SPOT, STOP), fpm_index=1)
     ),
     "'spot' asks for a matrix transform": lambda: changed(1, propagation_hint="MFT"),
     "'spot'.*there must be a pupil plane": lambda: make(PUPIL, STOP, SPOT),
     "expected a poppy.OpticalSystem": poppy.Instrument,
-    "moves it by one sample": lambda: make(PUPIL, SPOT, ("invert", "y"), STOP),
+    "moves the field by one sample": lambda: make(PUPIL, SPOT, ("invert", "y"), STOP),
     r"'circular mask'.*Use propagation='fft'": forced(propagation="compact"),
     "expected 'auto', 'compact' or 'fft'": forced(propagation={"circular mask": "mft"}),
     "normalize": lambda: forced()().calc_psf(normalize="lats"),

@@ -208,7 +208,7 @@ def test_the_embedded_coronagraph_has_the_orientation_of_stpsf(nircam):
             pixelscale=moved.pixelscale, si_wfe=moved._get_aberrations().zernike_coeffs,
             flip_si_wfe=flip, chromatic_reference=3.35e-6,
         )  # fmt: skip
-        planes = (base.planes[0], stop, base.planes[2])
+        planes = (base.between[0], stop, base.between[2])
         return OpticalSystem(model.entrance, planes, base.detector, base.bandpass)(
             star_offset=offset
         )

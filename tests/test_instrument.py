@@ -30,7 +30,7 @@ def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(mask, filter_nam
     """Where half of a planet's light passes the mask, and beyond it, where all does."""
     model = instrument.nircam_coronagraph(filter_name, image_mask=mask, nlambda=2, **SMALL)
     clear = instrument.nircam_coronagraph(filter_name, image_mask=None, nlambda=2, **SMALL)
-    assert model.planes[0].name == mask
+    assert model.between[0].name == mask
     scale = instrument.detector_place(mask, filter_name).pixelscale
     assert model.detector.pixelscale == (scale, scale)
     unocculted = float(clear(opd).sum())

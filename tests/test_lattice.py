@@ -90,7 +90,7 @@ def test_another_kind_of_plane_takes_the_models_own_route():
             return wavefront
 
     plain = system()
-    planes = [*plain.planes, Unknown()]
+    planes = [*plain.between, Unknown()]
     model = OpticalSystem(plain.entrance, planes, plain.detector, plain.bandpass)
     sources = PointSources(model, OPD)
     assert sources.route == "model"

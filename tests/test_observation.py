@@ -238,7 +238,7 @@ def test_few_cells_of_the_occulter_are_enough_for_a_round_mask(name, mask):
             image, expected = model(opd, place), fine(opd, place)
         assert float((image - expected).abs().max() / expected.max()) < 1e-6
     spacings = [
-        finest_spacing(model.planes[0], model.detector, wavelength, model.planes[0].sampling)
+        finest_spacing(model.between[0], model.detector, wavelength, model.between[0].sampling)
         for wavelength in model.bandpass.wavelengths
     ]
     assert min(spacings) == pytest.approx(min(model.detector.pixelscale) * ARCSEC)

@@ -83,7 +83,7 @@ def test_the_stop_moves_and_turns_as_in_stpsf(stpsf_path):
     openings = maskrnd_openings()[1:]
     stop = LyotStop(openings, NPIX, JWST_DIAMETER, torch.float64, torch.device("cpu"))
     assert np.abs(stop.amplitude({}).numpy().sum() - lyot_stop(NPIX).sum()) < 1e-9
-    planes = [stop if plane.name == "MASKRND" else plane for plane in model.planes]
+    planes = [stop if plane.name == "MASKRND" else plane for plane in model.between]
     system = OpticalSystem(model.entrance, planes, model.detector, model.bandpass)
 
     def away(x, y, turn):
@@ -149,8 +149,8 @@ def test_the_embedded_occulter_is_that_of_stpsf(stpsf_path, aperture, band, wave
         truth = instrument.calc_psf(**call)[1].data
         model = from_webbpsf(instrument, **call)
         assert embedded.detector.pixelscale == pytest.approx(model.detector.pixelscale, abs=1e-9)
-        planes = [embedded.planes[0] if plane.name == mask else plane for plane in model.planes]
-        assert embedded.planes[0] in planes
+        planes = [embedded.between[0] if plane.name == mask else plane for plane in model.between]
+        assert embedded.between[0] in planes
         system = OpticalSystem(model.entrance, planes, model.detector, model.bandpass)
         image = system().numpy()  # The star is where stpsf has it, as part of the entrance.
         allowed = limit_of_bars if bar else limit

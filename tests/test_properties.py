@@ -48,7 +48,7 @@ def test_no_plane_adds_light(npix, offset, rms, seed, shift, angle, ny, oversamp
     values = model.values(given_)
     wavefront = model.pupil_field(opd, WAVELENGTH, values)
     light = [power(wavefront)]
-    for plane, onto in zip(model.planes, model.windows(values), strict=True):
+    for plane, onto in zip(model.between, model.windows(values), strict=True):
         before, wavefront = wavefront, plane.apply(wavefront, values, onto)
         light.append(power(wavefront))
         if plane.name != "MASK335R":

@@ -90,7 +90,7 @@ def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path):
     place = detector_place("MASK335R", "F210M")
     assert model.setup["filter"] == "F210M"
     assert model.detector.pixelscale == place.siaf_pixelscale
-    assert model.planes[0].name == "MASK335R"
+    assert model.between[0].name == "MASK335R"
     assert not model.defaults
     long = GaussNewton.nircam("F444W")
     short = settings_for(frame)
@@ -155,7 +155,7 @@ def test_the_place_along_a_bar_is_that_of_the_header():
     known = GaussNewton.nircam("F335M").deviations["lyot_rotation"]
     assert settings_for(frame).deviations["lyot_rotation"] > 2 * known
     # The narrow end is 8.3 arcsec from the middle of a bar of 20.
-    assert model.planes[0].reach[0] == pytest.approx(18.30, abs=0.01)
+    assert model.between[0].reach[0] == pytest.approx(18.30, abs=0.01)
     # With fewer samples a copy of the star would be hidden as well, and be taken off twice.
     with pytest.raises(IncompatibleSetupError, match="npix: got 128"):
         model_for(frame, npix=128)

@@ -24,14 +24,13 @@ from astropy.table import Table
 from benchmarks.provenance import processor
 from benchmarks.speed.case import Accuracy, Case
 from benchmarks.speed.memory import peak_memory
-from benchmarks.speed.page import write_page
 from benchmarks.speed.rows import ROWS, Row, select_rows
-from benchmarks.speed.scaling import SCALING, limits
+from benchmarks.speed.scaling import SCALING
 from benchmarks.speed.setting import Setting
 from benchmarks.speed.timing import exponent, interleaved
 from pyklip_diffrender.io.files import replacing
 
-__all__ = ["ROWS", "Setting", "run_bench", "write_page", "write_table"]
+__all__ = ["ROWS", "Setting", "run_bench", "write_table"]
 
 _log = logging.getLogger(__name__)
 
@@ -82,10 +81,10 @@ def run_bench(
     -------
     Table
         One row for each case: seconds (of the timed piece times `times`), the duration of the
-        row's reference over that of the case (`ratio`), `error` (see `ROWS`), `sigma` (rms in
-        units of the paper scene's noise), `memory` (bytes), `size` (for scaling). Cases that could
-        not be measured have NaN and a note. In `meta`: provenance, the reference of every row,
-        exponents, and the machine's limits.
+        row's reference over the duration of the case (`ratio`), `error` (see `ROWS`), `sigma` (rms
+        in units of the paper scene's noise), `memory` (bytes), `size` (for scaling). Cases that
+        could not be measured have NaN and a note. In `meta`: provenance, the reference of every
+        row, and exponents.
 
     Raises
     ------
@@ -122,7 +121,6 @@ def run_bench(
         "errors": {row.name: row.error for row in selected},
         "references": references,
         "exponents": _exponents(table),
-        "limits": limits(setting) if any(row.name == SCALING for row in selected) else [],
     }
     table.meta["seconds"] = round(time.perf_counter() - began)
     return table

@@ -4,8 +4,7 @@ Run from the root of the project, with the package installed:
 
     python -m benchmarks.speed --quick
 
-It prints the table and writes it, with its figure, into a folder. ``--page`` makes the page of the
-documentation from a table that was written before.
+It prints the table and writes it into a folder.
 """
 
 from __future__ import annotations
@@ -19,9 +18,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.speed import Setting, run_bench, write_page, write_table
-from benchmarks.speed.figure import draw
-from pyklip_diffrender.drawing import save
+from benchmarks.speed import Setting, run_bench, write_table
 from pyklip_diffrender.errors import DiffrenderError
 
 COMMAND = "python -m benchmarks.speed"
@@ -47,10 +44,6 @@ def parser() -> argparse.ArgumentParser:
         "--stpsf-path", default="", help="data directory of stpsf (or STPSF_PATH)"
     )
     command_line.add_argument("--no-memory", action="store_true", help="skip memory measurement")
-    command_line.add_argument(
-        "--page", type=Path, metavar="TABLE",
-        help="measure nothing; write performance.md from this table into the output folder",
-    )  # fmt: skip
     return command_line
 
 
@@ -72,9 +65,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> None:
-    if options.page:
-        print(f"wrote {write_page(options.page, options.output)}")
-        return
     flags = ["--quick"] * options.quick + (["--rows", *options.rows] if options.rows else [])
     table = run_bench(
         Setting(options.quick, options.device, options.stpsf_path),
@@ -84,10 +74,7 @@ def _run(options: argparse.Namespace) -> None:
         command=" ".join([COMMAND, shlex.join(flags)]).strip(),
     )
     table["row", "column", "precision", "seconds", "ratio", "error", "sigma"].pprint_all()
-    figure = options.output / "performance.png"
-    save(draw(table), figure)
-    for path in (write_table(table, options.output), figure):
-        print(f"wrote {path}")
+    print(f"wrote {write_table(table, options.output)}")
 
 
 if __name__ == "__main__":

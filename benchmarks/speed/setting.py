@@ -184,7 +184,7 @@ class Setting:
         stop = model.pupil_field(torch.zeros(self.npix, self.npix), WAVELENGTH, {})
         # Divided by what came in, the planes behind the occulter are what they do to a 1.
         stop = type(stop)(torch.ones(full.shape, dtype=torch.complex128), WAVELENGTH, full)
-        for plane, window in zip(model.planes[1:], model.windows({})[1:], strict=True):
+        for plane, window in zip(model.between[1:], model.windows({})[1:], strict=True):
             stop = plane.apply(stop, {}, window)
         cell = WAVELENGTH / model.diameter / CELLS
         return Arrays(

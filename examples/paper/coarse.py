@@ -7,7 +7,8 @@ from torch import Tensor
 
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.planes import Values
-from pyklip_diffrender.optics.system import OpticalSystem, Value
+from pyklip_diffrender.optics.propagation import Value
+from pyklip_diffrender.optics.system import OpticalSystem
 
 __all__ = ["coarse_steps"]
 
@@ -25,7 +26,7 @@ class _CoarseSteps(OpticalSystem):
     def __init__(self, coarse: OpticalSystem, constants: dict[float, Tensor]) -> None:
         super().__init__(
             coarse.entrance,
-            coarse.planes,
+            coarse.between,
             coarse.detector,
             coarse.bandpass,
             recipe=coarse.recipe,

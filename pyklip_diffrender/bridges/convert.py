@@ -39,7 +39,7 @@ from pyklip_diffrender.bridges.sampled_planes import (
     turns_behind,
 )
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
+from pyklip_diffrender.io.units import ARCSEC, native_float64
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import Detector, Plane
@@ -50,8 +50,8 @@ Array = NDArray[Any]
 class Conversion:
     """The planes of a poppy system, which passes `check_supported`, as planes of this package.
 
-    `recipe` has the arguments of `from_poppy`, `kinds` names of pupil planes that become a subclass
-    of `PupilOptic`. IncompatibleSetupError for settings that do not fit the system.
+    `recipe` has the arguments of `from_poppy`, and `kinds` subclasses of `PupilOptic` for pupil
+    planes, by name. IncompatibleSetupError for settings that do not fit the system.
     """
 
     def __init__(
@@ -63,13 +63,8 @@ class Conversion:
         self.osys, self.recipe, self.kinds = osys, recipe, kinds or {}
         self.dtype: torch.dtype = recipe["dtype"]
         self.device = torch.device(recipe["device"])
-        wavelengths = np.atleast_1d(to_metres(recipe["wavelength"], "wavelength"))
-        weights = recipe["weights"]
-        weights = np.ones(len(wavelengths)) if weights is None else native_float64(weights)
-        self.bandpass = Bandpass(
-            tuple(wavelengths.tolist()), tuple(np.atleast_1d(weights).tolist())
-        )
-        first = osys.input_wavefront(wavelengths[0] * u.m)
+        self.bandpass = Bandpass.of(recipe["wavelength"], recipe["weights"])
+        first = osys.input_wavefront(self.bandpass.wavelengths[0] * u.m)
         self.sampled = int(first.wavefront.shape[0])
         """Samples across the pupil at which poppy's optics are evaluated."""
         self.npix = int(recipe["npix"] or self.sampled)
@@ -86,10 +81,10 @@ class Conversion:
         self.sampling = math.ceil(self.npix * sampling - 1e-9) / self.npix
         # For every image plane, "compact" or "fft".
         self.propagation: dict[str, str] = {}
-        # Settings that cannot be changed without changing what the system computes.
+        # Settings that are part of the system, and cannot be changed.
         self.fixed: set[str] = set()
         self._has_stop = False
-        # For every plane of poppy's, from its frame to the frame of the system's pupils.
+        # Changes from the frame of each plane of poppy to the frame of the system's pupils.
         turns = turns_behind(osys.planes)
         self.frames = [self._to_system(turn) for turn in turns]
         self.planes = self._convert_planes(turns)
@@ -101,7 +96,7 @@ class Conversion:
         planes: list[Plane] = []
         centred = "array_center"
         stack: list[Any] = []
-        # Whether a mask has scattered light beyond the pupil array that no aperture held back.
+        # Whether a mask has scattered light beyond the pupil array and no aperture held it back.
         scattered = False
         pupil = PupilGrid.full(self.npix, self.diameter)
         for k in range(1, len(self.osys.planes) - 1):
@@ -109,7 +104,7 @@ class Conversion:
             if optic.planetype == PlaneType.inversion:
                 planes.append(Gain(optic.name))
             elif optic.planetype == PlaneType.rotation:
-                angle = -optic.angle * turn.sense  # The system's frame is a mirror of poppy's.
+                angle = -optic.angle * turn.sense  # The system's frame mirrors the frame of poppy.
                 # poppy rotates the pupil array alone, without the light beyond it.
                 planes.append(
                     Gain(optic.name, edge=pupil)
@@ -135,13 +130,13 @@ class Conversion:
         return planes
 
     def _to_system(self, turn: Orientation) -> Orientation:
-        """From the frame of a pupil plane to the system's, in which y is inverted."""
+        """Change from the frame of a pupil plane to the system's frame, where y is inverted."""
         return turn.then(Orientation.inversion("y"))
 
     def _between_masks(self, index: int) -> bool:
         """Whether a plane lies between masks, where light scattered beyond the pupil matters.
 
-        Uniform image planes are no masks. Behind the last mask poppy cuts that light off.
+        Uniform image planes are no masks. Behind the last mask, poppy cuts off scattered light.
         """
         masks = [
             plane.planetype == PlaneType.image and not isinstance(plane, poppy.ScalarTransmission)
@@ -170,8 +165,8 @@ class Conversion:
             if not opds:
                 amplitude = np.broadcast_to(np.abs(phasor), shape)
             opds[wavelength] = self._averaged(np.broadcast_to(opd, shape))
-        # The OPD at the first wavelength is that of calls without one; what it differs by at the
-        # others is added in every call.
+        # Calls without an OPD have the OPD at the first wavelength. The differences from this OPD
+        # at other wavelengths are added in every call.
         base = opds[self.bandpass.wavelengths[0]]
         # poppy counts the angle of a source from +y, counter-clockwise.
         r, theta = float(self.osys.source_offset_r), np.deg2rad(self.osys.source_offset_theta)
@@ -369,8 +364,8 @@ def _turned_factor(
     axis: int,
 ) -> Callable[[Tensor], Tensor] | None:
     """The factor of a separable part along one axis of the final image."""
-    # Turns are by right angles, so that an axis of the image is one of the plane's, up to its sign:
-    # one element of the matrix's column is not 0.
+    # Turns are by right angles, so that an axis of the image is, up to the sign, an axis of the
+    # plane: one element of the column of the matrix is not 0.
     column = (to_plane.matrix[0][axis], to_plane.matrix[1][axis])
     factor, sign = (along_x, column[0]) if column[0] else (along_y, column[1])
     return None if factor is None else lambda positions: factor(sign * positions)

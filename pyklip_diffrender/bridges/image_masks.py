@@ -1,8 +1,8 @@
 """Image-plane masks of any shape, and poppy's optics evaluated at chosen positions.
 
-They all sample the image on the same lattice, multiples of ``lambda / diameter / sampling`` about
-the axis. The light that a mask removes is computed only where it removes any. The three methods
-differ in speed, but not in their result, apart from rounding.
+All masks sample the image on the same lattice, multiples of ``lambda / diameter / sampling`` about
+the axis. The light that a mask removes is computed only where the mask is not clear. The three
+methods differ in speed; the results agree to rounding.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ Box = tuple[float, float, float, float]
 def _lattice(low: float, high: float, spacing: float, limit: float) -> Tensor:
     """Multiples of `spacing` that cover an interval, all in radians.
 
-    A sampled pupil repeats its image outside the range from ``-limit`` to `limit`, so light must
-    not be removed there a second time.
+    The image of a sampled pupil repeats outside the range from ``-limit`` to `limit`, where light
+    must not be removed a second time.
     """
     edge = round(limit / spacing)
     first = max(math.floor(low / spacing), -edge)
@@ -54,7 +54,7 @@ def _lattice(low: float, high: float, spacing: float, limit: float) -> Tensor:
 
 
 def padded_pupil(npix: int, diameter: float, padding: float) -> PupilGrid:
-    """Return the pupil array with `padding` times as many samples, as in an FFT."""
+    """The pupil array with `padding` times as many samples, as in an FFT."""
     size = round(npix * padding)
     # poppy pads by whole samples on both sides, with the odd one, if any, at the end.
     first = -((size - npix) // 2)
@@ -62,7 +62,7 @@ def padded_pupil(npix: int, diameter: float, padding: float) -> PupilGrid:
 
 
 class MaskPart(Protocol):
-    """A part of a mask, as its effect on the field in the pupil behind it."""
+    """A part of a mask, which changes the field in the pupil behind the mask."""
 
     def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
         """Field to subtract on the window `onto`; `spacing` of the lattice in radians."""
@@ -144,7 +144,7 @@ class SeparablePart:
             index = torch.arange(count) - count // 2
             values = factor(index * spacing / ARCSEC).to(torch.float64)
             # Pupil samples at a distance d are coupled by the d-th Fourier coefficient of the
-            # factor; the sign of the exponent is that of `MatrixFourier`, opposite in y.
+            # factor; the sign of the exponent is as in `MatrixFourier`, opposite in y.
             coefficients = torch.fft.fft(torch.fft.ifftshift(values)) / count
             if axis == "y":
                 coefficients = coefficients.conj()
@@ -159,10 +159,10 @@ class SeparablePart:
     def _convolved(
         self, field: Tensor, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid
     ) -> Tensor:
-        # For n samples in front and m behind there are n + m - 1 distances, beginning with that
-        # from the last sample in front to the first one behind. An FFT of that length wraps around,
-        # but not in the elements n - 1 to n + m - 2 of the convolution, which are the samples
-        # behind.
+        # For n samples in front and m behind there are n + m - 1 distances, beginning with the
+        # distance from the last sample in front to the first sample behind. An FFT of that length
+        # wraps around, but not in the elements n - 1 to n + m - 2 of the convolution, which are the
+        # samples behind.
         spectrum = self._spectrum(axis, wavefront, spacing, onto)
         dim = -1 if axis == "x" else -2
         first = field.shape[dim] - 1
@@ -187,8 +187,8 @@ class SampledOcculter(Plane):
     """A mask that is clear except for its parts, which share a lattice.
 
     Complements of the parts add up; `sampling` is in lattice points per lambda / `diameter`. `grid`
-    is the window with all the light in front of the mask: the pupil array, or the padded one if a
-    mask scatters light beyond the pupil array and no aperture holds it back.
+    is the window with all the light in front of the mask: the pupil array, or the padded pupil
+    array if a mask scatters light beyond the pupil array and no aperture holds it back.
     """
 
     focal = True
@@ -231,7 +231,7 @@ class SampledOcculter(Plane):
     ) -> CompactOcculter | None:
         """The first part as a `CompactOcculter`, without the other parts.
 
-        None if that part has no box, or changes the phase of the light.
+        None if the first part has no box, or changes the phase of the light.
         """
         part = self.parts[0]
         if not isinstance(part, BoxPart):
@@ -292,7 +292,7 @@ class FourierMask(Plane):
             lattice = torch.fft.ifftshift(self.transmission(wavefront.wavelength))
             return lattice.to(wavefront.field)
 
-        # One wavelength at a time: at eight points per lambda/D one is a gigabyte.
+        # Only the latest wavelength is stored: with eight points per lambda/D it takes a gigabyte.
         position = (("wavelength", wavefront.wavelength),)
         return cached(self._latest, wavefront.field.dtype, position, make)
 
@@ -310,8 +310,6 @@ class FourierMask(Plane):
         field = torch.fft.fft2(torch.fft.ifft2(field) * lattice)
         return replace(wavefront, field=self.grid.crop(field, onto), grid=onto)
 
-
-# Evaluate poppy's optics at chosen positions.
 
 Array = NDArray[Any]
 
@@ -338,7 +336,7 @@ class ImageSamples(poppy.Wavefront):
             oversample=oversample,
             pixelscale=spacing * u.arcsec / u.pix,
         )
-        # Only its shape is used, so it needs no memory.
+        # Only the shape of the field is used, so that the field needs no memory.
         self.wavefront = np.broadcast_to(np.complex128(1), tuple(x.shape))
         self.planetype = PlaneType.image
         self._last_transform_type = "FFT"
@@ -350,7 +348,7 @@ class ImageSamples(poppy.Wavefront):
 
 
 class MaskStack:
-    """Several masks, poppy's optics, in one image plane."""
+    """Several optics of poppy in one image plane."""
 
     def __init__(self, optics: list[Any]) -> None:
         self.optics = optics
@@ -358,7 +356,7 @@ class MaskStack:
 
     @classmethod
     def of(cls, optics: list[Any]) -> Any:
-        """A stack, or the mask itself if there is only one."""
+        """A stack of masks, or the mask itself if there is only one."""
         return optics[0] if len(optics) == 1 else cls(optics)
 
     def get_phasor(self, wave: poppy.Wavefront) -> Array:
@@ -400,7 +398,7 @@ class Part:
 
 
 def complement_box(optic: Any, margin: float) -> list[Part] | None:
-    """The parts of an image-plane optic that are not clear, or None if they have no bounds.
+    """Parts of an image-plane optic that are not clear; None if these parts have no bounds.
 
     `margin` (arcsec) is added for anti-aliased edges.
     """

@@ -22,68 +22,65 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import resample
-from pyklip_diffrender.optics.planes import Detector
-from pyklip_diffrender.optics.system import OpticalSystem, poppy_psf, refuse_keywords
-
-# The fields at all planes as `poppy.Wavefront` objects.
+from pyklip_diffrender.optics.planes import Detector, Values
+from pyklip_diffrender.optics.system import REFUSED, OpticalSystem
 
 Array = NDArray[Any]
 
 
 def intermediate_wavefronts(
-    system: OpticalSystem,
-    orientations: Sequence[Orientation],
+    system: PoppySystem,
     normalize: str,
+    opd: Any,
+    parameters: Mapping[str, Any],
     only_last: bool,
 ) -> list[poppy.Wavefront]:
-    """Fields as poppy's own objects, one per plane, weighted and summed as poppy does.
+    """Fields as `poppy.Wavefront`, one per plane, weighted and summed as poppy does.
 
-    For an image plane, the field behind the mask on the sampled part of the image. `orientations`
-    are those of the planes relative to poppy's, the entrance pupil first; `normalize` must be
-    "first". With `only_last` there is the field on the detector alone.
+    The field of an image plane is the field behind the mask on the sampled part of the image.
+    `normalize` must be "first". With `only_last`, there is the field on the detector alone.
     """
     if normalize.lower() != "first":
         raise IncompatibleSetupError(
             f"normalize={normalize!r}: intermediate wavefronts come with 'first' only"
         )
     summed: list[poppy.Wavefront] = []
+    tensor, values = system.opd(opd), system.values(parameters)
     for wavelength, weight in zip(
         system.bandpass.wavelengths, system.bandpass.weights, strict=True
     ):
-        for k, wave in enumerate(_wavefronts(system, orientations, wavelength, only_last)):
+        for k, wave in enumerate(_wavefronts(system, tensor, values, wavelength, only_last)):
             wave.wavefront = wave.wavefront * weight
             if k == len(summed):
                 summed.append(wave)
             elif summed[k].shape == wave.shape:
                 summed[k].wavefront = summed[k].wavefront + wave.wavefront
             # Otherwise an image plane, sampled in proportion to the wavelength, has another number
-            # of samples; that of the first wavelength is kept.
+            # of samples; the field at the first wavelength is kept.
     return summed
 
 
 def _wavefronts(
-    system: OpticalSystem, orientations: Sequence[Orientation], wavelength: float, only_last: bool
+    system: PoppySystem, opd: Tensor, values: Values, wavelength: float, only_last: bool
 ) -> list[poppy.Wavefront]:
-    values = system.values({})
     full = system.entrance.full
     waves = []
     with torch.no_grad():
-        wavefront = system.pupil_field(system.opd(None), wavelength, values)
+        wavefront = system.pupil_field(opd, wavelength, values)
         windows = system.windows(values)
-        planes: list[Any] = [system.entrance, *system.planes]
-        for k, plane in enumerate(planes):
-            to_poppy = orientations[k].inverse
+        for k, plane in enumerate(system.planes[:-1]):
+            to_poppy = system.frames[k].inverse
             if isinstance(plane, SampledOcculter | FourierMask):
                 field, spacing = plane.focal_sample(wavefront)
                 wave = _wave_of(field, wavelength, full.diameter, spacing / ARCSEC)
                 if isinstance(plane, FourierMask):
                     field = to_poppy.apply_to_lattice(field)
                 else:
-                    # On the image the inversion of y is undone.
+                    # In the image, the inversion of y is undone.
                     field = Orientation.inversion("y").then(to_poppy).apply(field)
                 wave.wavefront = _numpy(field)
             if k > 0:
-                wavefront = system.planes[k - 1].apply(wavefront, values, windows[k - 1])
+                wavefront = system.between[k - 1].apply(wavefront, values, windows[k - 1])
             if not isinstance(plane, SampledOcculter | FourierMask):
                 pupil = to_poppy.apply(wavefront.grid.crop(wavefront.field, full)) * full.spacing
                 wave = _wave_of(pupil, wavelength, full.diameter, None)
@@ -105,7 +102,7 @@ def _numpy(field: Tensor) -> Array:
 def _wave_of(
     field: Tensor, wavelength: float, diameter: float, arcsec: float | None
 ) -> poppy.Wavefront:
-    """A field in a pupil, or on an image with samples of a given size."""
+    """A `poppy.Wavefront` of a field in a pupil, or in an image with samples of `arcsec`."""
     sampling = {} if arcsec is None else {"pixelscale": arcsec * u.arcsec / u.pix}
     wave = poppy.Wavefront(wavelength=wavelength * u.m, npix=1, diam=diameter * u.m, **sampling)
     wave.wavefront = _numpy(field)
@@ -116,18 +113,11 @@ def _wave_of(
     return wave
 
 
-# `from_poppy`: make a differentiable system of a poppy `OpticalSystem`, and export wavefronts.
-
-REFUSED = {
-    "save_intermediates": "this system writes no files of its own; pass return_intermediates=True "
-    "and call .writeto() on the wavefronts",
-    "display_intermediates": "display=True draws the PSF alone; pass return_intermediates=True and "
-    "call .display() on the wavefronts",
-    "progressbar": "a PSF of this system is not made in steps that take long; leave it out",
-    "inwave": "the entrance pupil makes the field of this system; give a wavefront as opd, and the "
-    "place of the source as star_offset",
-}
-"""Keywords of poppy's `calc_psf` that a converted system does not serve, and why."""
+WRITTEN_BY_CALLER = (
+    "this system writes no files of its own; pass return_intermediates=True and call .writeto() on "
+    "the wavefronts"
+)
+"""Why `save_intermediates` is refused."""
 
 _SUPPORTED = (
     "pupil and image planes of any optic with a transmission and an OPD, coordinate "
@@ -136,10 +126,16 @@ _SUPPORTED = (
 
 
 class PoppySystem(OpticalSystem):
-    """An `OpticalSystem` made from poppy's, with its names and interface; see `Conversion`."""
+    """An `OpticalSystem` made from an `OpticalSystem` of poppy; see `Conversion`."""
 
     _source: ClassVar[str] = "osys"
-    """Argument that defines the system, as opposed to settings of it."""
+    """Argument that defines the system; all others are settings."""
+    _refused: ClassVar[Mapping[str, str]] = {
+        "save_intermediates": WRITTEN_BY_CALLER,
+        "display_intermediates": "display=True draws the PSF alone; pass return_intermediates=True "
+        "and call .display() on the wavefronts",
+        **REFUSED,
+    }
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **OpticalSystem._replaced,
         "wavelength": ("weights",),
@@ -167,7 +163,7 @@ class PoppySystem(OpticalSystem):
     def adjustable(self) -> frozenset[str]:
         """See `OpticalSystem.adjustable`.
 
-        Without "occulter_sampling" if a mask depends on poppy's own sampling of the image
+        "occulter_sampling" is missing if a mask depends on poppy's sampling of the image
         (four-quadrant masks).
         """
         return frozenset({*self.recipe, "bandpass"} - {self._source, *self._fixed})
@@ -182,71 +178,15 @@ class PoppySystem(OpticalSystem):
             return super().at_wavelengths(bandpass)
         return self._remade(self._band(bandpass))
 
-    def calc_psf(  # type: ignore[override]  # As an OpticalSystem of poppy, not an Instrument.
-        self,
-        wavelength: Any = None,
-        weight: Any = None,
-        save_intermediates: bool = False,
-        save_intermediates_what: str = "all",
-        display: bool = False,
-        return_intermediates: bool = False,
-        return_final: bool = False,
-        source: dict[str, Any] | None = None,
-        normalize: str = "first",
-        display_intermediates: bool = False,
-        progressbar: bool = False,
-        inwave: poppy.Wavefront | None = None,
-        opd: Any = None,
-        **parameters: Any,
-    ) -> Any:
-        """PSF as an HDUList, with the arguments and the keywords of poppy's `calc_psf`.
+    def _intermediates(
+        self, normalize: str, opd: Any, parameters: Mapping[str, Any], only_last: bool
+    ) -> list[poppy.Wavefront]:
+        """See `intermediate_wavefronts`."""
+        return intermediate_wavefronts(self, normalize, opd, parameters, only_last)
 
-        Parameters
-        ----------
-        wavelength : Quantity, float (m) or sequence of them, optional
-            Default: the wavelengths that the system was made for.
-        weight : sequence of float, optional
-            One per wavelength; default equal.
-        source : dict, optional
-            With "wavelengths" and "weights", in place of the two above.
-        normalize : str
-            "first", "last", "exit_pupil" or "none", as in poppy.
-        return_intermediates, return_final : bool
-            Also return a list of `poppy.Wavefront`: one for every pupil plane and the detector,
-            or the one on the detector. They are summed over wavelengths as poppy does.
-        display : bool
-            Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
-        opd, **parameters
-            As in a call of the system.
-        save_intermediates, display_intermediates, progressbar, inwave
-            Refused with a pointer to what does the same.
-        save_intermediates_what
-            Without effect, as in poppy where no intermediate planes are saved.
-
-        Returns
-        -------
-        HDUList, or (HDUList, list of Wavefront)
-
-        Raises
-        ------
-        IncompatibleSetupError
-            For a keyword of poppy's that this system does not serve, with the reason, and for an
-            unknown `normalize`.
-        """
-        refuse_keywords(REFUSED, locals())
-        if source is not None:
-            wavelength, weight = source["wavelengths"], source["weights"]
-        system: Any = self
-        if wavelength is not None:
-            system = self.with_fidelity(wavelength=wavelength, weights=weight)
-        hdus = poppy_psf(system, normalize, opd, **parameters)
-        if display:
-            system.draw_psf(hdus, parameters)
-        if not (return_intermediates or return_final):
-            return hdus
-        return hdus, intermediate_wavefronts(
-            system, system.frames, normalize, only_last=not return_intermediates
-        )
+    def display(self, **keywords: Any) -> None:
+        """Draw all planes as poppy does, with the keywords of `display` of its optics."""
+        self.recipe[self._source].display(**keywords)
 
 
 def from_poppy(
@@ -263,33 +203,33 @@ def from_poppy(
 ) -> PoppySystem:
     """Make a differentiable system of a poppy `OpticalSystem`.
 
-    ``model()`` is the image that ``osys.calc_psf`` gives, binned to detector pixels; ``model(opd)``
-    replaces the OPD of the first plane, in that plane's own frame; ``model.entrance.opd`` is the
-    one it has. Source offsets of `osys` are kept, and `star_offset` adds to them.
+    ``model()`` is the image of ``osys.calc_psf``, binned to detector pixels. ``model(opd)`` has
+    another OPD of the first plane, in the frame of that plane, than ``model.entrance.opd``. Source
+    offsets of `osys` are kept; `star_offset` is added.
 
     The result can be passed to `refine` and `detect` like any other system.
 
     Parameters
     ----------
     osys : poppy.OpticalSystem
-        Fraunhofer system of pupil, image and detector planes. It is not changed, and later
-        changes to it do not reach the model.
+        Fraunhofer system of pupil, image and detector planes. The conversion does not change the
+        system, and later changes of the system do not affect the model.
     wavelength : Quantity, float (m) or sequence of them
         Wavelengths at which the optics are evaluated.
     weights : sequence of float, optional
         One per wavelength; default equal.
     propagation : "auto", "compact", "fft", or mapping of plane name to one of these
-        How to pass image planes. "compact" evaluates a mask only where it blocks light, which
-        must be a bounded part of the image; "fft" uses FFTs padded as poppy's. "auto" takes
-        "compact" where that is possible; ``model.propagation`` records the choice.
+        Propagation through image planes. "compact" evaluates a mask only where light is blocked,
+        which must be a bounded part of the image; "fft" uses FFTs padded as in poppy. "auto" is
+        "compact" where possible; ``model.propagation`` records the choice.
     occulter_sampling : float, optional
-        Samples per lambda/D in image planes; default ``osys.oversample``, with which the model
-        and poppy agree to rounding either way. FFTs are padded by the next whole number.
+        Samples per lambda/D in image planes. With the default, ``osys.oversample``, the model and
+        poppy agree to rounding with either propagation. FFTs are padded by the next whole number.
     npix : int, optional
-        Samples across the pupil, a divisor of poppy's number: the sampled planes are averaged
-        over blocks. Default poppy's own.
+        Samples across the pupil, a divisor of the number in poppy, which is the default: sampled
+        planes are averaged over blocks.
     fov_pixels : int or (ny, nx), optional
-        Detector pixels; default those of the system's detector.
+        Detector pixels; default as in the system's detector.
     dtype : torch.dtype
         torch.float64 or torch.float32.
     device : str or torch.device
@@ -322,7 +262,7 @@ def from_poppy(
 
 
 def _from_private(**recipe: Any) -> PoppySystem:
-    """As `from_poppy`, for a system that is not shared with the caller."""
+    """A system as by `from_poppy`, from an `osys` that is not shared with the caller."""
     return PoppySystem(Conversion(recipe["osys"], recipe), recipe, _from_private)
 
 
@@ -332,8 +272,8 @@ def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:
     Parameters
     ----------
     opd : Tensor, Quantity or array, (n, n)
-        m, frame of the first plane; for example a refined wavefront. It is resampled to the pixels
-        of that plane.
+        OPD in m, in the frame of the first plane; for example a refined wavefront. The map is
+        resampled to the pixels of that plane.
     osys : poppy.OpticalSystem
         Not changed.
 
@@ -371,8 +311,8 @@ def check_supported(osys: Any) -> None:
         )
     if type(osys).propagate is not poppy.OpticalSystem.propagate:
         raise IncompatibleSetupError(
-            f"{osys.name}: a {type(osys).__name__} propagates, or samples its image planes, in a "
-            "way of its own; convert the poppy.OpticalSystem that it was made from"
+            f"{osys.name}: a {type(osys).__name__} does not propagate, or sample image planes, as "
+            "a poppy.OpticalSystem does; convert the poppy.OpticalSystem from which it was made"
         )
     planes = list(osys.planes)
     if not planes or planes[0].planetype != PlaneType.pupil:
@@ -402,8 +342,8 @@ def check_supported(osys: Any) -> None:
         if turning and previous.planetype == PlaneType.image:
             raise IncompatibleSetupError(
                 f"plane {plane.name!r} turns the field in the image plane {previous.name!r}, "
-                "where poppy moves it by one sample as well. Put it in front of that plane, "
-                "or behind the next pupil"
+                "where poppy moves the field by one sample as well. Put the turn in front of that "
+                "plane, or behind the next pupil"
             )
         previous = plane
     if previous.planetype == PlaneType.image:

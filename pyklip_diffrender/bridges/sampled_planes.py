@@ -1,7 +1,7 @@
 """Planes made from sampled arrays in any orientation.
 
-Inside a system all pupil arrays have the frame in which `MatrixFourier` makes the final image. The
-planes of this module take arrays in the frame of their own plane and turn them.
+Inside a system, all pupil arrays have the frame in which `MatrixFourier` makes the final image. The
+planes of this module take arrays in the frame of the plane, and turn these arrays.
 """
 
 from __future__ import annotations
@@ -33,8 +33,6 @@ from pyklip_diffrender.optics.planes import (
 )
 from pyklip_diffrender.parameters import parameter
 
-# Flips and quarter turns between the frames of successive planes, kept exact; other turns.
-
 Matrix = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -59,7 +57,7 @@ class Orientation:
         return turned
 
     def then(self, later: Orientation) -> Orientation:
-        """Return the change, followed by another."""
+        """This change, followed by a later one."""
         a, b = later.matrix, self.matrix
         rows = [[sum(a[i][k] * b[k][j] for k in (0, 1)) for j in (0, 1)] for i in (0, 1)]
         return Orientation(((rows[0][0], rows[0][1]), (rows[1][0], rows[1][1])))
@@ -88,7 +86,7 @@ class Orientation:
     def apply_to_lattice(self, array: Tensor) -> Tensor:
         """Turn an array (..., n, n) whose middle is sample n // 2, as after an FFT, n even.
 
-        The samples at ``-n / 2`` have no mirror image and stay, because they are periodic.
+        The samples at ``-n / 2`` have no mirror image and stay, because the lattice is periodic.
         """
         return self._turn(array, roll=1)
 
@@ -110,7 +108,7 @@ def is_quarter_turn(optic: Any) -> bool:
 
 
 def turns_behind(planes: Sequence[Any]) -> list[Orientation]:
-    """For every plane, the product of all quarter turns and inversions behind it."""
+    """Products of all quarter turns and inversions behind each plane."""
     turns, turn = [], Orientation()
     for optic in reversed(planes):
         turns.append(turn)
@@ -132,14 +130,11 @@ def free_turn(planes: Sequence[Any]) -> float:
     return total
 
 
-# Rotation of a sampled pupil field by any angle, as in poppy.
-
-
 class SplineRotation:
     """Cubic-spline rotation of arrays: `scipy.ndimage.rotate` as a linear torch function.
 
     `angle` is in degrees, from the first axis of the array to the second, as scipy counts; `shape`
-    is that of the output as well.
+    is the shape of input and output.
     """
 
     def __init__(self, angle: float, shape: tuple[int, int]) -> None:
@@ -150,7 +145,7 @@ class SplineRotation:
         half = [(n - 1) / 2 for n in shape]
         y = (torch.arange(shape[0], dtype=torch.float64) - half[0])[:, None]
         x = (torch.arange(shape[1], dtype=torch.float64) - half[1])[None, :]
-        # Where the sample at (y, x) of the result is in the array: the rotation back, about the
+        # Place in the array of the sample at (y, x) of the result: the rotation back, about the
         # middle.
         from_row = cosine * y + sine * x + half[0]
         from_column = -sine * y + cosine * x + half[1]
@@ -216,16 +211,13 @@ class FreeRotation(Plane):
         return replace(wavefront, field=self._full.crop(field, onto), grid=onto)
 
 
-# Planes made from sampled arrays in any orientation.
-
-
 class OrientedPupil(EntrancePupil):
-    """An entrance pupil in any frame, with a wavefront and a pointing of its own.
+    """An entrance pupil in any frame, with a wavefront and a pointing.
 
-    `amplitude` and `opd` (m), for calls without one, are (npix, npix) in the frame of the entrance
-    pupil, which `orientation` takes to that of the system. `pointing`, x, y in arcsec on the image,
-    is added to every star offset, and `chromatic` has for wavelengths (m) an OPD (m, same frame)
-    that is added to that of every call.
+    `amplitude` and `opd` (m), which calls without an OPD have, are (npix, npix) in the frame of the
+    entrance pupil, which `orientation` takes to the frame of the system. `pointing`, x, y in arcsec
+    on the image, is added to every star offset, and `chromatic` has, by wavelength (m), an OPD (m,
+    same frame) that is added to the OPD of every call.
     """
 
     sampled = True
@@ -246,8 +238,8 @@ class OrientedPupil(EntrancePupil):
     ) -> None:
         array = orientation.apply(amplitude).contiguous().to(device)
         super().__init__(array, diameter, dtype, name)
-        # The sum of the squared amplitude of the true pupil, in units of a sample's area: samples
-        # that are means over partly blocked areas have less.
+        # `collected` is the sum of the squared amplitude of the true pupil, in units of the area of
+        # a sample. Samples that are means over partly blocked areas have less.
         if collected is not None:
             self.amplitude = self.amplitude * math.sqrt(self.total / collected)
             self.total = collected
@@ -278,7 +270,7 @@ class PupilOptic(Plane):
     """Amplitude and phase in a pupil plane, one array per wavelength (m).
 
     Complex amplitude transmissions are (npix, npix) in the frame of this plane, which `orientation`
-    takes to that of the system; a larger array reaches beyond the pupil by as much on every side.
+    takes to the frame of the system; a larger array reaches beyond the pupil equally on all sides.
     """
 
     sampled = True
@@ -322,7 +314,7 @@ class PupilOptic(Plane):
 
 
 class MovableStop(PupilOptic):
-    """A stop known from its samples only, that can be shifted and turned as a `planes.LyotStop`."""
+    """A sampled stop that can be shifted and turned as a `planes.LyotStop`."""
 
     parameters = ("lyot_shift", "lyot_rotation")
     margin = 0.06
@@ -336,14 +328,14 @@ class MovableStop(PupilOptic):
         return any(name in values for name in self.parameters)
 
     def window(self, values: Values) -> PupilGrid:
-        """See `PupilOptic.window`; with a margin if the stop is moved."""
+        """The window of `PupilOptic`, with a margin if the stop is moved."""
         if not self._moves(values):
             return self.grid
         return self.grid.widened(self.margin * self._full.diameter)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Multiply by the stop at its position."""
-        # At rest the samples are used directly. Elsewhere they are interpolated by cubic
+        # The samples of a stop at rest are used directly. A moved stop is interpolated by cubic
         # convolution, which is exact for shifts by whole samples.
         if not self._moves(values):
             return super().apply(wavefront, values, onto)
@@ -365,7 +357,7 @@ class MovableStop(PupilOptic):
         angle = torch.deg2rad(values.get("lyot_rotation", zero[:1])).reshape(())
         x = window.x.to(phasor.device)[None, :] - shift[0]
         y = window.y.to(phasor.device)[:, None] - shift[1]
-        # The position in the stop at rest of each sample: the inverse motion.
+        # The inverse motion gives the position of each sample in the stop at rest.
         from_x = torch.cos(angle) * x + torch.sin(angle) * y
         from_y = -torch.sin(angle) * x + torch.cos(angle) * y
         spacing = self.grid.spacing
@@ -380,7 +372,7 @@ def _cubic(array: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     # the distances 1 + t, t, 1 - t and 2 - t. Differentiable in forward and reverse mode, unlike
     # torch's `grid_sample`.
     ny, nx = array.shape
-    edge = 4  # Positions far outside are clamped to this margin of zeros.
+    edge = 4  # Samples of the margin of zeros to which positions far outside are clamped.
     flat = torch.nn.functional.pad(array, (edge,) * 4).flatten()
     taps = []
     for position, count in ((rows, ny), (columns, nx)):
@@ -431,7 +423,7 @@ class AberrationOptic(PupilOptic):
         return replace(wavefront, field=wavefront.field * factor)
 
 
-@dataclass
+@dataclass(repr=False)
 class Gain(Plane):
     """A uniform factor; 1 for a plane without effect on the field."""
 
@@ -441,7 +433,7 @@ class Gain(Plane):
     pointwise = True
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        """Multiply."""
+        """Multiply by the factor."""
         if self.edge is not None:
             grid = wavefront.grid.intersection(self.edge)
             wavefront = replace(

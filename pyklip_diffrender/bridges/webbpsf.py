@@ -16,12 +16,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.bridges.convert import Conversion
-from pyklip_diffrender.bridges.poppy import (
-    REFUSED,
-    PoppySystem,
-    check_supported,
-    intermediate_wavefronts,
-)
+from pyklip_diffrender.bridges.poppy import WRITTEN_BY_CALLER, PoppySystem, check_supported
 from pyklip_diffrender.bridges.sampled_planes import AberrationOptic, SplineRotation
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.headers import set_keyword
@@ -36,25 +31,18 @@ from pyklip_diffrender.optics.planes import (
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.optics.system import (
-    OpticalSystem,
-    poppy_psf,
-    refuse_keywords,
-    require_one_sampling,
-    save,
-)
+from pyklip_diffrender.optics.psf_hdus import poppy_psf, require_one_sampling
+from pyklip_diffrender.optics.system import InstrumentSystem, OpticalSystem
 from pyklip_diffrender.wavefront.opd_map import check_opd, opd_to_hdus
-
-# Read the settings and the detector of an stpsf instrument without changing it.
 
 Array = NDArray[np.float64]
 
-_JITTER = 0.007
+_JITTER_ARCSEC = 0.007
 """Width of Gaussian jitter where none is given, arcsec (poppy's default)."""
 
 
 def private_copy(nircam: Any) -> Any:
-    """Copy an instrument; the copy shares its data but none of its settings."""
+    """A copy of an instrument, which shares data but no settings with the original."""
     instrument = copy.copy(nircam)
     instrument.options = dict(nircam.options)
     if hasattr(instrument.pupil, "v2v3"):
@@ -87,7 +75,7 @@ def oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[float]]:
-    """Wavelengths (m) and weights: those of a `Bandpass`, otherwise the choice of stpsf.
+    """Wavelengths (m) and weights of a `Bandpass`, otherwise by stpsf.
 
     `recipe` has "bandpass", "monochromatic", "nlambda" and "source", each possibly None.
     IncompatibleSetupError for a wavelength that the instrument's channel does not pass; a warning
@@ -136,7 +124,7 @@ def _warn_outside(instrument: Any, wavelength: float) -> None:
 
 @contextmanager
 def data_errors() -> Iterator[None]:
-    """Replace stpsf's errors about missing files by one that names its data directory."""
+    """Replace errors of stpsf about missing files by an error with the folder of its data."""
     try:
         yield
     except (FileNotFoundError, OSError, RuntimeError) as error:
@@ -151,7 +139,7 @@ def data_errors() -> Iterator[None]:
 
 @contextmanager
 def kernel_files_left_open() -> Iterator[None]:
-    """Silence warnings about the detector kernel files that stpsf 2.2 leaves open."""
+    """Silence warnings about files of detector kernels, which stpsf 2.2 leaves open."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "unclosed file", ResourceWarning)
         yield
@@ -160,7 +148,7 @@ def kernel_files_left_open() -> Iterator[None]:
 def with_effects(
     detector: Detector, instrument: Any, fft_oversample: int, distortion: bool
 ) -> ChainDetector:
-    """A detector with the effects of an instrument: all up to DET_DIST, or jitter only.
+    """A detector with the effects of an instrument: up to DET_DIST, or jitter only.
 
     IncompatibleSetupError for a kind of jitter that is not supported.
     """
@@ -174,7 +162,7 @@ def with_effects(
                 f"options['jitter']: {jitter!r} is not supported, 'gaussian' and None are"
             )
         sigma = instrument.options.get("jitter_sigma")
-        on_samples.append(GaussianBlur((_JITTER if sigma is None else sigma) / scale))
+        on_samples.append(GaussianBlur((_JITTER_ARCSEC if sigma is None else sigma) / scale))
     on_pixels: list[Effect] = []
     if distortion:
         header = _header(instrument, shape, oversample, fft_oversample, scale)
@@ -202,7 +190,7 @@ def with_effects(
 def _header(
     instrument: Any, shape: tuple[int, int], oversample: int, fft_oversample: int, scale: float
 ) -> Any:
-    """The header keywords that stpsf's own detector functions read."""
+    """Header keywords that the detector functions of stpsf read."""
     data = np.zeros((shape[0] * oversample, shape[1] * oversample))
     hdus = fits.HDUList([fits.PrimaryHDU(data)])
     hdus[0].header["OVERSAMP"] = fft_oversample
@@ -250,17 +238,15 @@ def _crosstalk(instrument: Any, header: Any) -> list[Array]:
     return [np.asarray(kernel.array, dtype=np.float64) for kernel in kernels]
 
 
-# `from_webbpsf`: make a system of an stpsf (webbpsf) NIRCam object, and export wavefronts.
-
-
-class WebbSystem(PoppySystem):
+class WebbSystem(PoppySystem, InstrumentSystem):
     """A `PoppySystem` made from an stpsf instrument by `from_webbpsf`."""
 
-    instrument: Any  # the model's own copy, as of its conversion
-    # Whether the map of the instrument's internal wavefront error is flipped vertically, as stpsf
-    # does from 2.2.0 on; None without one.
+    instrument: Any  # private copy of the instrument, as of the conversion
+    # Whether the map of the instrument's internal wavefront error is flipped vertically, as in
+    # stpsf from 2.2.0 on; None without a map.
     si_wfe_flipped: bool | None
     _source: ClassVar[str] = "nircam"
+    _refused: ClassVar[Mapping[str, str]] = {"save_intermediates": WRITTEN_BY_CALLER}
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **PoppySystem._replaced,
         "monochromatic": ("bandpass",),
@@ -288,86 +274,38 @@ class WebbSystem(PoppySystem):
             changes = {"bandpass": self.bandpass, **changes}
         return super()._remade(changes)
 
-    def calc_psf(  # type: ignore[override]  # An instrument's arguments, not an OpticalSystem's.
+    def _changes(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Arguments of `calc_psf`, which are settings of `from_webbpsf`."""
+        return given
+
+    def _extensions(
         self,
-        outfile: str | os.PathLike[str] | None = None,
-        source: Any = None,
-        nlambda: int | None = None,
-        monochromatic: Any = None,
-        fov_arcsec: float | None = None,
-        fov_pixels: int | tuple[int, int] | None = None,
-        oversample: int | None = None,
-        detector_oversample: int | None = None,
-        fft_oversample: int | None = None,
-        overwrite: bool = True,
-        display: bool = False,
-        save_intermediates: bool = False,
-        return_intermediates: bool = False,
-        normalize: str = "first",
-        add_distortion: bool = True,
-        crop_psf: bool = True,
-        opd: Any = None,
-        **parameters: Any,
-    ) -> Any:
-        """PSF as an HDUList, with the arguments, extensions and keywords of stpsf's `calc_psf`.
-
-        Arguments that are not given keep the values that the system was made with. The image is
-        this system's; stpsf itself then adds jitter, distortion, detector effects and header.
-
-        Parameters
-        ----------
-        opd, **parameters
-            As in a call of the system, for the PSF of a refined wavefront.
-        display : bool
-            Draw the PSF, extension OVERSAMP, in a new figure of matplotlib on a logarithmic scale.
-        save_intermediates
-            Refused with a pointer to `return_intermediates`.
-
-        Returns
-        -------
-        HDUList, or (HDUList, list of poppy.Wavefront)
-            OVERSAMP, DET_SAMP, OVERDIST and DET_DIST, the last two with `add_distortion`.
-        """
-        refuse_keywords(
-            {"save_intermediates": REFUSED["save_intermediates"]},
-            {"save_intermediates": save_intermediates},
-        )
-        arguments = {
-            "source": source,
-            "nlambda": nlambda,
-            "monochromatic": monochromatic,
-            "fov_arcsec": fov_arcsec,
-            "fov_pixels": fov_pixels,
-            "oversample": oversample,
-            "detector_oversample": detector_oversample,
-            "fft_oversample": fft_oversample,
-        }
-        changes = {name: value for name, value in arguments.items() if value is not None}
-        system: Any = self.with_fidelity(**changes)
-        result = poppy_psf(system, normalize, opd, **parameters)
-        instrument = system.instrument
+        normalize: str,
+        opd: Any,
+        parameters: Mapping[str, Any],
+        options: Mapping[str, Any],
+    ) -> fits.HDUList:
+        """The PSF of this system with the jitter, distortion, detector and header of stpsf."""
+        result = poppy_psf(self, normalize, opd, **parameters)
+        instrument = self.instrument
         options = {
             **instrument.options,
-            "add_distortion": add_distortion,
-            "crop_psf": crop_psf,
-            "detector_oversample": system.detector.oversample,
-            "fft_oversample": oversampling(system.recipe)[0],
+            **options,
+            "detector_oversample": self.detector.oversample,
+            "fft_oversample": oversampling(self.recipe)[0],
         }
         with kernel_files_left_open():
             instrument._apply_jitter(result, options)
             instrument._get_fits_header(result, options)
             instrument._calc_psf_format_output(result, options)
-        if system.si_wfe_flipped is not None:
+        if self.si_wfe_flipped is not None:
             for hdu in result:
-                set_keyword(hdu.header, "DRSIFLIP", system.si_wfe_flipped)
-        save(result, outfile, overwrite)
-        if display:
-            system.draw_psf(result, parameters)
-        if return_intermediates:
-            return result, intermediate_wavefronts(
-                system, system.frames, normalize, only_last=False
-            )
+                set_keyword(hdu.header, "DRSIFLIP", self.si_wfe_flipped)
         return result
+
+    def display(self, **keywords: Any) -> None:
+        """Draw all planes as stpsf does, which takes no keywords."""
+        private_copy(self.instrument).display(**keywords)
 
 
 def from_webbpsf(
@@ -395,27 +333,27 @@ def from_webbpsf(
     The system has the instrument's filter, masks, options (source offset, pupil shift and
     rotation, shift of the occulter, ND squares, jitter), pixel scale, OPD and internal wavefront
     errors with their field dependence. ``model()`` is stpsf's DET_SAMP, or DET_DIST with
-    `add_distortion`; ``model(opd)`` replaces the whole OPD of the telescope, and
-    ``model.entrance.opd`` is the one it has.
+    `add_distortion`. ``model(opd)`` has another OPD of the whole telescope than
+    ``model.entrance.opd``.
 
     The result can be passed to `refine` and `detect` like any other system.
 
     Parameters
     ----------
     nircam : stpsf.NIRCam
-        Not changed; later changes to it do not affect the model.
+        Instrument, which is not changed. Later changes of the instrument do not affect the model.
     fov_pixels, fov_arcsec, oversample, detector_oversample, fft_oversample, monochromatic,
     nlambda, source
-        As in stpsf's `calc_psf`, with its defaults.
+        As in stpsf's `calc_psf`, with the same defaults.
     bandpass : Bandpass, optional
         Wavelengths and weights, in place of `monochromatic`, `nlambda` and `source`.
     add_distortion : bool
         Include the effects in stpsf's DET_DIST: rotation, distortion, charge diffusion, IPC, PPC.
     flip_si_wfe : bool, optional
-        Whether to flip the coronagraph's internal wavefront error vertically; default as in the
-        installed stpsf, which flips it from 2.2.0 on. See ``model.si_wfe_flipped``.
+        Whether the coronagraph's internal wavefront error is flipped vertically; default as in the
+        installed stpsf: flipped from 2.2.0 on. See ``model.si_wfe_flipped``.
     propagation, occulter_sampling, npix, dtype, device
-        See `from_poppy`; the default sampling is `fft_oversample`, the default `npix` that of
+        See `from_poppy`; the default sampling is `fft_oversample`, the default `npix` as in
         ``nircam.pupil``.
 
     Returns
@@ -462,14 +400,14 @@ def from_webbpsf(
         )
     check_supported(osys)
     first = osys.planes[0]
-    # Before stpsf adds the field dependence, which is not blank outside the pupil.
+    # The map without the field dependence, which is not blank outside the pupil.
     original = getattr(first, "_opd_original", first.opd)
     check_opd(np.asarray(original), np.asarray(first.amplitude), "pupilopd")
     aberrations = _aberrations(osys)
     flipped = None if aberrations is None else _set_flip(aberrations, flip_si_wfe)
     conversion = Conversion(
         osys,
-        # The field of view is already that of the detector.
+        # The detector of `osys` already has the field of view.
         {**recipe, "wavelength": wavelengths, "weights": weights, "fov_pixels": None},
         {} if aberrations is None else {aberrations.name: AberrationOptic},
     )
@@ -489,11 +427,11 @@ def _aberrations(osys: Any) -> Any:
 
 
 def _set_flip(plane: Any, flip: bool | None) -> bool:
-    """Flip the map of internal aberrations if wanted; return whether it is now flipped."""
+    """Flip the map of internal aberrations if wanted; return whether the map is now flipped."""
     flipped = bool(getattr(plane, "_is_OPD_flipped_for_NRC_coron", False))
     if flip is None or flip == flipped:
         return flipped
-    # The map alone: focus and tilt, which depend on the wavelength, are added to it later.
+    # Only the map is flipped. Focus and tilt, which depend on the wavelength, are added later.
     plane.opd = plane.opd[::-1].copy()
     return flip
 
@@ -501,16 +439,16 @@ def _set_flip(plane: Any, flip: bool | None) -> bool:
 def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
     """A refined wavefront in the form of ``nircam.pupilopd``.
 
-    stpsf adds the telescope's field dependence to `pupilopd`; it is subtracted here, so that the
-    telescope as a whole has the given OPD at the position of `nircam`.
+    stpsf adds the telescope's field dependence to `pupilopd`. This function subtracts the field
+    dependence, so that the whole telescope has the given OPD at the position of `nircam`.
 
     Parameters
     ----------
     opd : Tensor, Quantity or array, (n, n)
-        m, entrance-pupil orientation; for example a refined wavefront. It is resampled to the
-        pixels of ``nircam.pupil``.
+        OPD in m, in entrance-pupil orientation; for example a refined wavefront. The map is
+        resampled to the pixels of ``nircam.pupil``.
     nircam : stpsf.NIRCam
-        Not changed. Set its ``pupilopd`` to the result.
+        Instrument, which is not changed. Set ``nircam.pupilopd`` to the result.
 
     Returns
     -------

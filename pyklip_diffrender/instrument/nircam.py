@@ -32,7 +32,8 @@ from pyklip_diffrender.optics.planes import (
     PixelCrosstalk,
     Plane,
 )
-from pyklip_diffrender.optics.system import OpticalSystem, Value
+from pyklip_diffrender.optics.propagation import Value
+from pyklip_diffrender.optics.system import InstrumentSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 
 # NIRCam's internal wavefront error behind the Lyot stop, and its dependence on wavelength.
@@ -183,7 +184,7 @@ def nircam_coronagraph(
     route: str = "auto",
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
-) -> OpticalSystem:
+) -> InstrumentSystem:
     """NIRCam's coronagraph as a differentiable system.
 
     Lengths, angles and temperatures may be Quantities.
@@ -256,7 +257,7 @@ def nircam_coronagraph(
 
     Returns
     -------
-    OpticalSystem
+    InstrumentSystem
 
     Raises
     ------
@@ -280,7 +281,7 @@ def nircam_coronagraph(
     detector = _detector(place, recipe)
     _require_samples(npix, place.period(bar_reach) if image_mask else 0.0, detector, bandpass)
     amplitude = _pupil(npix, recipe["segment_gap"], pupil).to(detector.device)
-    return OpticalSystem(
+    return InstrumentSystem(
         EntrancePupil(amplitude, JWST_DIAMETER, dtype, name="JWST pupil"),
         _planes(place, bandpass, recipe),
         detector,

@@ -28,10 +28,8 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 
-# The unknowns of a linear model, and the part that one frame has in it.
-
-_PIXELS = 1024
-"""Number of pixels that are processed at a time, where there is a number for every unknown."""
+_PIXELS_AT_A_TIME = 1024
+"""Number of pixels that are processed at a time, in arrays with a number for every unknown."""
 
 
 class Unknown(NamedTuple):
@@ -40,7 +38,7 @@ class Unknown(NamedTuple):
     # A parameter of the parameter table, or "companions", "amplitude", "modes" or "drift".
     name: str
     component: int  # Index within that parameter.
-    # The frame whose own value it is, or the block of drift; -1 if all frames share it.
+    # Index of the frame, or of the block of drift; -1 for an unknown that all frames share.
     frame: int = -1
 
     def __str__(self) -> str:
@@ -50,12 +48,12 @@ class Unknown(NamedTuple):
 
 @dataclass(frozen=True)
 class FrameRows:
-    """The unknowns of a fit that the rows of one of its frames belong to."""
+    """Unknowns of a fit to which the rows of one frame belong."""
 
-    rows: Tensor  # (rows,), int64, index of the unknown that each row belongs to.
+    rows: Tensor  # (rows,), int64, index of the unknown of each row.
     # (blocks, some), int64, indices of the unknowns by which the leading wavefront modes of this
-    # frame differ from those that all frames share. One block may be the frame's own, and another
-    # one that of its exposure sequence.
+    # frame differ from the shared modes. One block may belong to this frame alone, and another
+    # block to all frames of an exposure sequence.
     drift: Tensor
     first_mode: int  # Index of the first wavefront mode among the rows.
 
@@ -85,7 +83,7 @@ class LinearFrame(FrameRows):
     # (rows, ny, nx), float32, derivatives of the pixels by the unknowns, in the data's unit.
     jacobian: Tensor
     # (ny, nx), float64, c of the pattern that the frames share, see `Noise`, in the data's unit; 0
-    # without one.
+    # without a pattern.
     common: Tensor
 
     def image(self, values: Tensor) -> Tensor:
@@ -96,12 +94,12 @@ class LinearFrame(FrameRows):
         return torch.cat(parts, dim=-1).unflatten(-1, self.jacobian.shape[1:])
 
     def pulled(self, images: Tensor) -> Tensor:
-        """Products of the derivatives with images, (k, ny, nx), in their precision: (rows, k)."""
+        """Products of the derivatives with images, (k, ny, nx): (rows, k), of the images' type."""
         return _times_images(self.jacobian.flatten(1), images)
 
 
 def _times_images(rows: Tensor, images: Tensor) -> Tensor:
-    """Products of rows (n, pixels), float32, and images (k, ny, nx), in their precision: (n, k)."""
+    """Products of float32 rows (n, pixels) and images (k, ny, nx): (n, k), of the images' type."""
     # The rounding errors of single precision exceed the noise where a companion's light is 1e5
     # standard deviations.
     columns = images.flatten(1).T
@@ -114,9 +112,9 @@ def _times_images(rows: Tensor, images: Tensor) -> Tensor:
 
 
 def pixel_pieces(pixels: int) -> list[slice]:
-    """Parts of an image of which arrays with all unknowns are small."""
-    starts = range(0, pixels, _PIXELS)
-    return [slice(start, min(start + _PIXELS, pixels)) for start in starts]
+    """Slices of the pixels of an image, for arrays with a number for every unknown."""
+    starts = range(0, pixels, _PIXELS_AT_A_TIME)
+    return [slice(start, min(start + _PIXELS_AT_A_TIME, pixels)) for start in starts]
 
 
 # The covariance of the noise of frames that are fitted together, and its inverse.
@@ -135,7 +133,7 @@ def pixel_pieces(pixels: int) -> list[slice]:
 #     C^-1 = W - W c c^T W,    c_f = s_f g / sqrt(1 + g^2 sum_f w_f^2 s_f^2),    W = diag(w_f^2),
 #
 # so that every inner product loses the product of two images that are summed over frames with the
-# weights W c. A `Noise` knows the pattern by its c. For images that are divided by their own noise,
+# weights W c. A `Noise` has the c of the pattern. For images that are divided by their own noise,
 # C^-1 = w M^-1 w with M^-1 = 1 - t t^T and t = w c.
 
 
@@ -145,8 +143,8 @@ class Noise:
 
     # By frame, w: (ny, nx), 1 / standard deviation of the independent noise; 0 for masked pixels.
     weight: tuple[Tensor, ...]
-    # By frame, c of the pattern that the frames share: (ny, nx), in the data's unit; 0 if they
-    # share none.
+    # By frame, c of the pattern that the frames share: (ny, nx), in the data's unit; 0 without a
+    # pattern.
     common: tuple[Tensor, ...]
 
     @cached_property
@@ -161,7 +159,7 @@ class Noise:
         return torch.stack(products).sum(dim=0)
 
     def summed(self, images: Mapping[int, Tensor]) -> Tensor:
-        """Sum of W c x over frames, for images x, (..., ny, nx), in their precision."""
+        """Sum of W c x over frames, for images x, (..., ny, nx), of the type of x."""
         total = torch.zeros_like(next(iter(images.values())))
         for k, image in images.items():
             total += (self.weight[k] ** 2 * self.common[k]).to(image.dtype) * image
@@ -170,8 +168,8 @@ class Noise:
     def inverse(self, images: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """C^-1 x over w of images x, (..., ny, nx), by frame; 0 in masked pixels.
 
-        Frames that are missing have no light. Without correlations between frames they are missing
-        in the result as well.
+        A missing frame has no light. Without correlations between frames, it is missing in the
+        result as well.
         """
         if not self.shares_pattern:
             return {k: self.weight[k].to(x.dtype) * x for k, x in images.items()}
@@ -208,7 +206,7 @@ class Noise:
         return torch.cat([each.flatten(1) for each in white.values()], dim=1)
 
     def at_pixels(self, pixels: Tensor) -> Noise:
-        """Noise of some pixels, indices (k,) into the flattened image; its arrays are (k,)."""
+        """Noise of some pixels, indices (k,) into the flattened image, with arrays (k,)."""
         return Noise(
             tuple(each.flatten()[pixels] for each in self.weight),
             tuple(each.flatten()[pixels] for each in self.common),
@@ -228,10 +226,10 @@ class Noise:
 
 
 def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Iterator[Tensor]:
-    """W c summed over frames with the derivative by every unknown, float32.
+    """Sums of W c over frames with the derivatives by every unknown, float32.
 
-    By piece of the image, (unknowns, some pixels), because all of it takes as much memory as the
-    Jacobians of all frames.
+    There is one array, (unknowns, some pixels), for each piece of the image, because an array of
+    all pixels takes as much memory as the Jacobians of all frames.
     """
     scales = [(f.weight**2 * f.common).float().expand(f.weight.shape).flatten() for f in frames]
     for pixels in pixel_pieces(frames[0].weight.numel()):
@@ -242,17 +240,15 @@ def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Iterator[Tensor
         yield total
 
 
-# The linear model of a fit: the Jacobian of all unknowns and their posterior covariance.
-
-_BATCH = 512
+_TEMPLATES_AT_A_TIME = 512
 """Number of templates that are processed at a time."""
 
 
 class TemplateProducts(NamedTuple):
     """Inner products of templates p with the data r, (k,) each, marginalised over all unknowns.
 
-    The amplitude is numerator / information, its standard deviation 1 / sqrt(information), or 1 /
-    sqrt(photon) if all unknowns were known.
+    The amplitude is numerator / information, with a standard deviation of 1 / sqrt(information),
+    or 1 / sqrt(photon) if all unknowns were known.
     """
 
     numerator: Tensor  # p . Sigma^-1 r, with the marginalised covariance Sigma of the data.
@@ -302,7 +298,7 @@ class LinearModel:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        # Without what is cached, which can be computed again and is larger than the rest.
+        # Cached properties can be computed again, and are larger than the fields.
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
@@ -322,8 +318,8 @@ class LinearModel:
     @cached_property
     def _factor(self) -> Tensor:
         """Lower Cholesky factor of P + G G^T, in scaled units."""
-        # Unknowns differ by many powers of ten. In the units U, the factor is that of U (P + G G^T)
-        # U, whose diagonal is 1.
+        # Unknowns differ by many powers of ten. In the units U, U (P + G G^T) U is factored, whose
+        # diagonal is 1.
         system = self.curvature * self._scale[:, None] * self._scale
         system.diagonal().add_((self._scale / self.deviation) ** 2)
         return torch.linalg.cholesky(system)
@@ -351,8 +347,8 @@ class LinearModel:
     def step(self) -> Tensor:
         """Most probable unknowns of the linear model minus `vector`, (unknowns,).
 
-        It is small after a fit that has converged. The unknowns themselves may be far from the
-        means of the priors, so that single precision would not do for them.
+        The step is small after a fit that has converged. The unknowns themselves may be far from
+        the means of the priors, where single precision would not be enough.
         """
         # The minimum of (r - J^T s) C^-1 (r - J^T s) + sum P (x0 + s - mean)^2 is where
         #
@@ -372,7 +368,7 @@ class LinearModel:
 
     @cached_property
     def _pattern_rows(self) -> Tensor:
-        """R of the pattern that the frames share, (unknowns, pixels), float32."""
+        """R of the shared pattern, see `_pulled`, (unknowns, pixels), float32."""
         return torch.cat(list(summed_rows(self.frames, len(self.vector))), dim=1)
 
     def _pulled(self, images: Mapping[int, Tensor]) -> Tensor:
@@ -381,7 +377,7 @@ class LinearModel:
         #
         #     J C^-1 x = sum_f J_f W_f x_f - R sum_f W_f c_f x_f,
         #
-        # where only the frames that have light count in the sums over x.
+        # where only frames with light count in the sums over x.
         size = len(self.vector)
         total = torch.zeros(size, len(next(iter(images.values()))), dtype=torch.float64)
         for k, image in images.items():
@@ -420,15 +416,16 @@ class LinearModel:
         Returns
         -------
         TemplateProducts
-            The amplitude is numerator / information, its standard deviation
+            The amplitude is numerator / information, with a standard deviation of
             1 / sqrt(information), or 1 / sqrt(photon) if all unknowns were known.
         """
         parts = []
         total = len(next(iter(templates.values())))
-        for start in range(0, total, _BATCH):
-            part = {k: images[start : start + _BATCH] for k, images in templates.items()}
+        for start in range(0, total, _TEMPLATES_AT_A_TIME):
+            piece = slice(start, start + _TEMPLATES_AT_A_TIME)
+            part = {k: images[piece] for k, images in templates.items()}
             # By the Woodbury identity p . Sigma^-1 p = p . C^-1 p - |L^-1 G p|^2. The last term is
-            # what the unknowns of the star absorb of the template.
+            # the part of the template that the unknowns of the star absorb.
             absorbed = (self.projected(part) ** 2).sum(dim=0)
             numerator = torch.zeros_like(absorbed)
             for k, images in part.items():
@@ -439,11 +436,12 @@ class LinearModel:
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def weigh_pixels(self, k: int, places: Tensor) -> TemplateProducts:
-        """Amplitudes of light in one pixel of frame k each, places (n, 2) as y, x; see `weigh`."""
-        # Images of n single pixels would make all products with the Jacobian n times as long as
-        # the n columns of it that they amount to.
+        """Amplitudes of light in single pixels of frame k, `places` (n, 2) as y, x; see `weigh`."""
+        # A product of the Jacobian with an image of a single pixel is a column of the Jacobian, and
+        # is not computed as a product, which takes much longer.
         parts = []
-        for some in (places @ torch.tensor([self.frames[k].weight.shape[1], 1])).split(_BATCH):
+        pixels = places @ torch.tensor([self.frames[k].weight.shape[1], 1])
+        for some in pixels.split(_TEMPLATES_AT_A_TIME):
             noise, frame = self.noise.at_pixels(some), self.frames[k]
             light = {k: torch.ones(len(some), dtype=torch.float64)}
             weighted = noise.weighted(light)
@@ -472,7 +470,7 @@ class LinearModel:
     def clean(self, templates: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """Sigma^-1 p of templates (k, ny, nx) by frame, whitened, for every frame of the model.
 
-        This is the part of the templates that the unknowns cannot reproduce.
+        The result is the part of the templates that the unknowns cannot reproduce.
         """
         # Sigma^-1 p = C^-1 (p - J^T s), with the change s of the most probable unknowns by p.
         change = self.response(templates)
@@ -498,14 +496,14 @@ class LinearModel:
     def without(
         self, name: str, light: Mapping[int, Tensor | NDArray[np.float64] | float]
     ) -> LinearModel:
-        """Remove unknowns from the model and add their light to the data.
+        """Return a model without some unknowns, whose light is added to the data.
 
         Parameters
         ----------
         name : str
             Name of the unknowns.
         light : mapping of int to array, (ny, nx)
-            Image of those unknowns by frame, in the data's unit.
+            Image of these unknowns by frame, in the data's unit.
         """
         keeps = torch.tensor([unknown.name != name for unknown in self.unknowns])
         # `place` is the new index of every unknown that stays.

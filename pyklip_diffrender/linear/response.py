@@ -16,18 +16,20 @@ from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.fast_path import PlaneWaves
 from pyklip_diffrender.optics.grid import STAR_RADIUS, PupilGrid, doubled_samples, zernike_basis
 from pyklip_diffrender.optics.planes import CompactOcculter, Wavefront
-from pyklip_diffrender.optics.system import OpticalSystem, Propagation, batch_of
+from pyklip_diffrender.optics.propagation import Propagation, batch_of
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.wavefront.bases import Basis, FourierModes, fourier_part
 
-# Derivatives of the complex field on the detector with respect to wavefront modes.
-
 NANOMETRE = 1e-9
-"""Wavefront coefficients are in nm inside a fit, so that its numbers are of order 1."""
+"""Unit of wavefront coefficients inside a fit, m, in which the coefficients are of order 1."""
 
 
 class ModeFields:
-    """Derivatives of the field with respect to modes, about a wavefront (npix, npix), m."""
+    """Derivatives of the complex field on the detector with respect to modes.
+
+    `opd`, (npix, npix) in m, is the wavefront about which the field is differentiated.
+    """
 
     def __init__(
         self, model: OpticalSystem, basis: Basis, opd: Tensor, values: dict[str, Tensor]
@@ -36,16 +38,16 @@ class ModeFields:
         wavelengths = model.bandpass.wavelengths
         with torch.no_grad():
             # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD): the field in the pupil times the mode is
-            # propagated. Cosines and sines are pairs of plane waves, whose propagation is faster,
-            # see `PlaneWaves`.
+            # propagated. Cosines and sines are pairs of plane waves, which propagate faster, see
+            # `PlaneWaves`.
             self._pupils = [model.pupil_field(opd, each, self._values) for each in wavelengths]
 
     @torch.no_grad()
     def batches(self, size: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
-        """Compute the derivatives with respect to all modes, `size` (at least 4) of them at a time.
+        """Derivatives with respect to all modes, for `size` (at least 4) modes at a time.
 
-        Yields the places of modes in the basis, (modes,), int64, and for each wavelength their
-        derivatives, (modes, ny, nx), complex64, per nm.
+        Yields the places of the modes in the basis, (modes,), int64, and the derivatives at each
+        wavelength, (modes, ny, nx), complex64, per nm.
         """
         first, fourier = fourier_part(self._basis) or (len(self._basis), None)
         waves = [] if fourier is None else self._plane_waves(fourier.reach)
@@ -59,7 +61,7 @@ class ModeFields:
                 yield first + modes, [each.to(torch.complex64) for each in changes]
 
     def _plane_waves(self, reach: int) -> list[PlaneWaves]:
-        """For each wavelength; an empty list if the model has none."""
+        """Plane waves at each wavelength; an empty list if the model has none."""
         waves = [self._model.plane_waves(each, self._values, reach) for each in self._pupils]
         return [each for each in waves if each is not None]
 
@@ -77,7 +79,7 @@ class ModeFields:
     def _from_waves(
         self, waves: list[PlaneWaves], fourier: FourierModes, size: int
     ) -> Iterator[tuple[Tensor, list[Tensor]]]:
-        """For the Fourier part, with places counted from its first mode."""
+        """Derivatives with respect to Fourier modes, with places counted from the first of them."""
         places = {(fx, fy): 2 * k for k, (fx, fy) in enumerate(fourier.cycles.tolist())}
         scales = [fourier.amplitude / 2 * _factor(each) for each in self._pupils]
         for fx in range(fourier.reach + 1):
@@ -85,12 +87,12 @@ class ModeFields:
             for start in range(0, len(every), max(1, size // 4)):
                 fy = every[start : start + max(1, size // 4)]
                 pairs = [(fx, each) for each in fy] + [(-fx, each) for each in fy]
-                # The wave opposite to (fx, 0) is (-fx, 0), so that only one of them is a pair.
+                # The wave opposite to (fx, 0) is (-fx, 0), so that the two are one pair.
                 known = [k for k, pair in enumerate(pairs) if pair in places]
                 cosines = torch.tensor([places[pairs[k]] for k in known])
                 changes = []
                 # With opposite waves e and e*, cos = (e + e*) / 2 and sin = i (e* - e) / 2. `plus`
-                # has +-fx with +fy, and `minus` the opposite of each: -+fx with -fy.
+                # has +-fx with +fy, and `minus` the opposite waves, -+fx with -fy.
                 for each, scale in zip(waves, scales, strict=True):
                     fields = each.fields(fx, slice(fy[0], fy[-1] + 1))
                     plus = fields[:, 0].flatten(0, 1)[known]
@@ -101,20 +103,18 @@ class ModeFields:
 
 
 def _factor(wavefront: Wavefront) -> complex:
-    """I k for an OPD in nm."""
+    """Factor i k of the derivative by an OPD in nm."""
     return 2j * math.pi / wavefront.wavelength * NANOMETRE
 
 
-# Derivatives of the field followed through changes in the last pupil.
-#
-# What acts between the last focal plane and the detector multiplies the field in the last pupil:
-# the instrument's internal aberration, and the phase ramp that shifts the image. A change of it
-# convolves all fields on the detector, and their derivatives, with one small kernel. That takes a
-# tenth of the time of new derivatives. A star that moves relative to the occulter moves the image
-# as well; the change of what the occulter blocks is neglected here.
+# The instrument's internal aberration, and the phase ramp that shifts the image, multiply the field
+# in the last pupil, between the last focal plane and the detector. A change of this factor
+# convolves all fields on the detector, and their derivatives, with one small kernel, in a tenth of
+# the time of new derivatives. A star that moves relative to the occulter moves the image as well;
+# the change of the light that the occulter blocks is neglected.
 
-_PIECE = 16
-"""Number of fields that are transformed at a time; they fit in the processor's cache."""
+_FIELDS_AT_A_TIME = 16
+"""Number of fields that are transformed at a time, which fit in the processor's cache."""
 
 
 class LastPupil:
@@ -129,7 +129,7 @@ class LastPupil:
         """Parameters that are Zernike coefficients of an OPD in this pupil, m."""
 
     def change(self, before: dict[str, Tensor], after: dict[str, Tensor]) -> float:
-        """Rms phase over the pupil, radians, that `multiply` would apply."""
+        """Rms phase over the pupil, radians, of a change of parameters."""
         wavenumber = 2 * math.pi / min(self._model.bandpass.wavelengths)
         # The rms of a tilt over a disc is a quarter of its diameter times the angle.
         tilt = self._shift(before, after).norm() * self._model.diameter / 4
@@ -141,12 +141,12 @@ class LastPupil:
     ) -> None:
         """Convolve fields on the detector, in place, as a change of parameters does.
 
-        There is one for every wavelength, (count, oversample ny, oversample nx), complex64. The
-        field outside the detector is taken for the field of its opposite edge.
+        There are fields for every wavelength, (count, oversample ny, oversample nx), complex64. The
+        field outside the detector is taken to be the field at the opposite edge.
         """
         for wavelength, field in zip(self._model.bandpass.wavelengths, fields, strict=True):
             factor = self._factor(wavelength, field, before, after)
-            for piece in field.split(_PIECE):
+            for piece in field.split(_FIELDS_AT_A_TIME):
                 piece.copy_(torch.fft.ifft2(torch.fft.fft2(piece).mul_(factor)))
 
     def _factor(
@@ -159,8 +159,8 @@ class LastPupil:
         """Factor of the spectrum of the samples, (ny, nx)."""
         detector = self._model.detector
         # The frequency f of samples that are t apart on the sky stands for the place lambda f / t
-        # in the pupil, where a shift of the image is a tilt of the OPD. The sign of y is that of
-        # `optics.planes`. The shear of the axes is negligible here.
+        # in the pupil, where a shift of the image is a tilt of the OPD. The sign of y is as in
+        # `optics.planes`. The shear of the axes is negligible.
         x, y = (
             torch.fft.fftfreq(count, dtype=torch.float64, device=field.device)
             * (sign * wavelength * detector.oversample / (scale * ARCSEC))
@@ -185,7 +185,7 @@ class LastPupil:
     def _difference(
         self, names: Sequence[str], before: dict[str, Tensor], after: dict[str, Tensor]
     ) -> Tensor:
-        """Change of named parameters, one after the other, float64 on the CPU."""
+        """Change of named parameters, concatenated, float64 on the CPU."""
         changes = []
         for name in names:
             zero = torch.zeros(parameter(name).size, dtype=torch.float64)
@@ -193,10 +193,8 @@ class LastPupil:
         return torch.cat([torch.zeros(0, dtype=torch.float64), *changes])
 
 
-# Derivatives of the image with respect to named parameters, such as a shift of the Lyot stop.
-#
-# As by the wavefront, the derivative of the complex field may come from a coarser model than the
-# field.
+# Derivatives with respect to named parameters, such as a shift of the Lyot stop, may come from a
+# coarser model than the field, as derivatives with respect to the wavefront do.
 
 _IMAGE_PARAMETERS = ("blur",)
 """Parameters that act on the image; all others act on the field."""
@@ -207,14 +205,14 @@ def field_derivatives(
 ) -> dict[str, list[Tensor]]:
     """Derivatives of the complex field on the detector with respect to named parameters.
 
-    `opd` is (npix, npix), m, and `values` must hold every name. By name, for every wavelength, they
-    are (components, ny, nx), per unit of the parameter table. Names that act on the image only,
-    such as "blur", have none.
+    `opd` is (npix, npix), m, and `values` must have every name. There are derivatives by name and
+    wavelength, (components, ny, nx), per unit of the parameter table, but none for parameters that
+    act on the image only, such as "blur".
     """
     moved = {name: values[name] for name in names if name not in _IMAGE_PARAMETERS}
     if not moved:
         return {}
-    # What acts behind the occulter needs no new propagation to it.
+    # Parameters behind the occulter need no new propagation to the occulter.
     behind = model.parameters_behind.intersection(moved)
     wavelengths = model.bandpass.wavelengths
     with torch.no_grad():
@@ -242,11 +240,11 @@ def image_derivatives(
     names: tuple[str, ...],
     slopes: dict[str, list[Tensor]],
 ) -> Tensor:
-    """Derivatives of the image from those of the field, for a star whose fields are known.
+    """Derivatives of the image from the derivatives of the field, `slopes`.
 
-    `fields` are the star's at each wavelength, of a finer model if there is one, and `slopes` are
-    from `field_derivatives`. The result is (components of all names in order, ny, nx), light per
-    pixel per unit of the parameter table.
+    `slopes` come from `field_derivatives`, and `fields` are the fields of the star at each
+    wavelength, by a finer model if there is one. The result is (components of all names in order,
+    ny, nx), light per pixel per unit of the parameter table.
     """
     rows = []
     for name in names:
@@ -266,13 +264,14 @@ def image_derivatives(
 
 
 def jacobian(function: Callable[[Tensor], Sequence[Tensor]], value: Tensor) -> list[Tensor]:
-    """Differentiate tensors with respect to a few real numbers, (components,), in reverse mode.
+    """Derivatives of tensors with respect to a few real numbers, (components,), in reverse mode.
 
-    For every output of the function, real or complex, the derivatives are (components, *its shape).
+    For every output of the function, real or complex, there are derivatives (components, *shape of
+    the output).
     """
     with torch.enable_grad():
-        # With weights v, the gradient of the outputs is J^T v. It is linear in v, and its
-        # derivative by v is J (J. Townsend, "A new trick for calculating Jacobian vector products",
+        # With weights v, the gradient of the outputs is J^T v, which is linear in v and has the
+        # derivative J (J. Townsend, "A new trick for calculating Jacobian vector products",
         # 2017). As in forward mode, the cost grows with the number of inputs. Forward mode takes
         # twice as long, because torch differentiates products with constants in Python.
         varied = value.detach().requires_grad_()
@@ -288,8 +287,6 @@ def jacobian(function: Callable[[Tensor], Sequence[Tensor]], value: Tensor) -> l
     ]
 
 
-# Jacobian of the image with respect to wavefront modes.
-#
 # For a small change d of the OPD the field is linear, E = E0 + J d, and the image changes by 2
 # Re(conj(E0) J) d. The field E0 comes from the model itself. J needs one propagation per mode and
 # comes from a coarser copy of the model: an error of a percent in a derivative costs an iteration,
@@ -297,17 +294,17 @@ def jacobian(function: Callable[[Tensor], Sequence[Tensor]], value: Tensor) -> l
 
 _log = logging.getLogger(__name__)
 
-_CELLS = 1.9
-"""Largest number of cells of the occulter per lambda/D. With this number one cell per pixel is
+_CELLS_PER_LAMBDA_D = 1.9
+"""Largest number of cells of the occulter per lambda/D in a coarse copy. One cell per pixel is then
 enough at all wavelengths of F444W, down to 3.9 um; two cells per pixel take four times as long."""
 
-_ROWS = 128
+_MODES_AT_A_TIME = 128
 """Number of modes whose images are computed at a time."""
 
 
 def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
     """Return the number of pupil samples of `coarse_copy`."""
-    masks = [plane.radius for plane in model.planes if isinstance(plane, CompactOcculter)]
+    masks = [plane.radius for plane in model.between if isinstance(plane, CompactOcculter)]
     reach = _bar_reach(model) or max(masks, default=0.0)
     period = max(_field(model), reach + STAR_RADIUS)
     npix = doubled_samples(npix, period, min(model.bandpass.wavelengths), model.diameter)
@@ -319,15 +316,16 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """Return a cheaper copy of a model for derivatives, or the model if its pupil is as coarse.
 
-    It has fewer pupil samples, coarse cells, single precision, and of a bar only the part within
-    `STAR_RADIUS` of the field. For a wide field or mask the number of samples is doubled until the
-    image does not repeat inside it.
+    The copy has fewer pupil samples, coarse cells, single precision, and only the part of a bar
+    within `STAR_RADIUS` of the field. For a wide field or mask, the number of samples is doubled
+    until the image does not repeat inside the field or mask.
     """
     if "npix" not in model.adjustable or model.npix <= npix:
         return model
+    sampling = model.recipe.get("occulter_sampling") or math.inf
     coarser = {
         "npix": coarse_npix(model, npix),
-        "occulter_sampling": min(_CELLS, model.recipe.get("occulter_sampling") or _CELLS),
+        "occulter_sampling": min(_CELLS_PER_LAMBDA_D, sampling),
         "bar_reach": _bar_reach(model),
         "dtype": torch.float32,
     }
@@ -341,8 +339,8 @@ def _field(model: OpticalSystem) -> float:
 
 
 def _bar_reach(model: OpticalSystem) -> float | None:
-    """Distance from the star up to which a bar matters for derivatives, arcsec; None: no bar."""
-    bars = [p for p in model.planes if isinstance(p, CompactOcculter) and p.reach[0] > p.reach[1]]
+    """Distance from the star up to which a bar matters for derivatives, arcsec; None without."""
+    bars = [p for p in model.between if isinstance(p, CompactOcculter) and p.reach[0] > p.reach[1]]
     if not bars or "bar_reach" not in model.adjustable:
         return None
     return min(bars[0].reach[0], _field(model) / 2 + STAR_RADIUS)
@@ -363,9 +361,9 @@ def downsample(opd: Tensor, npix: int) -> Tensor:
 class WavefrontResponse:
     """Derivative of the complex field on the detector with respect to wavefront modes.
 
-    It is about `opd` (n, n), m, of a coarse copy of `npix` pupil samples with at most so many
-    `wavelengths`. With `stored` the derivatives are computed now; otherwise in every call of
-    `image` until `store` is called.
+    A coarse copy of the model with `npix` pupil samples and at most so many `wavelengths` is
+    differentiated about `opd` (n, n), m. With `stored` the derivatives are computed at once;
+    otherwise in every call of `image` until `store` is called.
     """
 
     def __init__(
@@ -382,16 +380,16 @@ class WavefrontResponse:
     ) -> None:
         self.model, self.basis = model, basis
         # The field behind a coronagraph is a small difference of large fields. A small change of
-        # the wavefront changes the field by a large factor, but hardly changes its derivative.
-        # Therefore the derivative of the field is stored, and that of the image is computed from it
-        # and from the current field of the star.
+        # the wavefront changes the field by a large factor, but hardly changes the derivative of
+        # the field. This derivative is therefore stored, and the derivative of the image is
+        # computed from it and from the current field of the star.
         self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
         self.coarse = coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
         self._progress = progress
         self._fields: list[Tensor] | None = None
         pixels = math.prod(model.detector.shape) * model.detector.oversample**2
         self.size = 8 * len(basis) * pixels * len(bandpass.wavelengths)
-        """Number of bytes that are stored."""
+        """Size of the stored derivatives, bytes."""
         # Behind the occulter, arrays are padded to twice the size of the image.
         samples = max(math.prod(coarse.entrance.grid.shape), 4 * pixels)
         self._batch = batch_of(samples, coarse.dtype.to_complex(), coarse.device)
@@ -432,9 +430,9 @@ class WavefrontResponse:
         self._fields = None
 
     def _batches(self, count: int | None = None) -> Iterator[tuple[Tensor, list[Tensor]]]:
-        """Places of modes, and the derivatives of the field by them for each wavelength.
+        """Places of modes, and the derivatives of the field by these modes at each wavelength.
 
-        At least the leading `count` modes, if it is given.
+        With `count`, at least the leading `count` modes.
         """
         if self._fields is None:
             if self._mode_fields is None:
@@ -442,7 +440,7 @@ class WavefrontResponse:
             yield from self._mode_fields.batches(self._batch)
             return
         every = torch.arange(len(self.basis) if count is None else count)
-        for modes in every.split(_ROWS):
+        for modes in every.split(_MODES_AT_A_TIME):
             part = slice(int(modes[0]), int(modes[-1]) + 1)
             yield modes, [kept[part] for kept in self._fields]
 
@@ -453,15 +451,15 @@ class WavefrontResponse:
         amplitude_modes: int = 0,
         modes: int | None = None,
     ) -> Tensor:
-        """Derivative of the image for given fields of the star, as `OpticalSystem.fields` has them.
+        """Derivatives of the image by modes, for fields of the star from `OpticalSystem.fields`.
 
-        It is (modes + amplitude_modes, ny, nx), float32, light per pixel (fraction of what the
-        pupil collects) per nm, by the leading `modes` (default all), of which `amplitude_modes` are
-        amplitude modes as well.
+        The result is (modes + amplitude_modes, ny, nx), float32, light per pixel (fraction of the
+        light that the pupil collects) per nm. The first `modes` rows are for the leading wavefront
+        modes (default all), the others for the leading amplitude modes.
         """
-        # dI = sum_l 2 w_l Re(conj(E_l) J_l dx). An amplitude mode is an OPD of -i nm. It changes
-        # the field by -i times the change that the same OPD mode causes, so that its derivative is
-        # the imaginary part where the other has the real one.
+        # dI = sum_l 2 w_l Re(conj(E_l) J_l dx). An amplitude mode is an OPD of -i nm, and changes
+        # the field by -i times the change by the OPD mode. The derivative by an amplitude mode
+        # therefore has the imaginary part in place of the real part.
         modes = len(self.basis) if modes is None else modes
         detector, count = self.coarse.detector, max(modes, amplitude_modes)
         images = torch.empty(modes + amplitude_modes, *detector.shape, device=self.model.device)
@@ -488,52 +486,50 @@ def _weighted_sum(changes: Sequence[Tensor], weights: Sequence[Tensor]) -> Tenso
     """Sum over wavelengths of changes (modes, ny, nx) times weights (ny, nx)."""
     total = torch.zeros_like(changes[0])
     # Pieces that fit in the processor's cache are faster than the whole product.
-    for start in range(0, len(total), _PIECE):
-        piece = slice(start, start + _PIECE)
+    for start in range(0, len(total), _FIELDS_AT_A_TIME):
+        piece = slice(start, start + _FIELDS_AT_A_TIME)
         for change, weight in zip(changes, weights, strict=True):
             total[piece] += change[piece] * weight
     return total
 
 
-# Cache of derivatives of the field, which are used again where the field is nearly the same.
-
 _Derivatives = TypeVar("_Derivatives")
 
-_OPENINGS = 20.0
+_FIELD_CHANGE_PER_STOP_DIAMETER = 20.0
 """Relative change of the field for a shift of the Lyot stop by one pupil diameter. The openings of
 the stop are about a twentieth of a diameter wide."""
 
-_TILT = 0.35
+_RESPONSE_ERROR_PER_RADIAN = 0.35
 """Error of a response that followed a shift of the star, per radian of tilt: 0.17 on average and
-0.35 for low modes, whose light falls on the occulter."""
+0.35 for low modes, which put light on the occulter."""
 
-_TILT_OF_SLOPES = 0.5
+_SLOPE_ERROR_PER_RADIAN = 0.5
 """Error of derivatives by other parameters that followed a shift of the star, per radian of tilt.
-The position of the star needs accurate ones."""
+The position of the star needs accurate derivatives."""
 
-_FOLLOWED = 0.1
+_FOLLOWED_ERROR_PER_RADIAN = 0.1
 """Error of derivatives that followed another change in the last pupil, per radian: 0.05 within half
 of the field and 0.2 at its edges."""
 
-_UNSEEN = 0.01
+_UNFOLLOWED_RADIANS = 0.01
 """Change in the last pupil, radians, that is not followed."""
 
 
 @dataclass
 class _About:
-    """Where derivatives were computed, and where they have been taken since."""
+    """Wavefront and parameters for which derivatives were computed, and taken since."""
 
-    opd: Tensor  # Inside the pupil, m.
-    values: dict[str, Tensor]  # Of the parameters where the derivatives were computed.
-    now: dict[str, Tensor]  # Of the parameters to which the derivatives followed.
+    opd: Tensor  # OPD inside the pupil, m.
+    values: dict[str, Tensor]  # Parameters for which the derivatives were computed.
+    now: dict[str, Tensor]  # Parameters to which the derivatives have followed.
 
 
 class Reading:
-    """Takes derivatives from a cache, and knows the largest error of those that it has taken.
+    """Access to the derivatives of a cache that records the largest error of what was taken.
 
     The cache computes derivatives again where the field has changed by more than `allowed`, and
-    stores `keep` responses, no new ones if this is the last reading (`is_last`); `farthest` is the
-    largest change since those that were taken were computed.
+    stores `keep` responses, but no new response if this is the last reading (`is_last`). `farthest`
+    is the largest change of the field since the derivatives were computed.
     """
 
     def __init__(self, cache: ResponseCache, allowed: float, keep: int, is_last: bool) -> None:
@@ -564,9 +560,9 @@ class Reading:
 class ResponseCache:
     """Cache of wavefront responses, and of derivatives with respect to other parameters.
 
-    Whoever needs to know how far its derivatives are from exact ones takes them by a `Reading`.
-    Responses take at most `memory` bytes. Those that do not fit are computed again whenever they
-    are needed, about the same wavefront.
+    A `Reading` takes derivatives and says how far they are from exact derivatives. Stored responses
+    take at most `memory` bytes. Responses that do not fit are computed again whenever they are
+    needed, about the same wavefront.
     """
 
     def __init__(
@@ -582,11 +578,12 @@ class ResponseCache:
         progress: bool = False,
     ) -> None:
         self.model, self.basis, self.npix, self.wavelengths = model, basis, npix, wavelengths
-        # The relative change of the field (radians for a phase), rms over the pupil, above which
-        # derivatives are computed again, unless a `Reading` allows another one. With parameter
-        # derivatives computed at a distance of 0.2 (15 mas in the star's position), the stated
-        # error of the star's position is half the correct one, and the position is off by four
-        # times that error. Frames differ in the star's position, so that each keeps a response.
+        # `relinearise` is the relative change of the field (radians for a phase), rms over the
+        # pupil, above which derivatives are computed again, unless a `Reading` allows another
+        # change. With derivatives that were computed at a distance of 0.2 (15 mas in the star's
+        # position), the stated error of the star's position is half the true error, and the
+        # position is off by four times as much. Frames differ in the star's position, so that each
+        # frame keeps a response.
         self._relinearise, self._keep = relinearise, keep
         self.memory, self.progress = memory, progress
         self._kept: list[tuple[_About, WavefrontResponse]] = []
@@ -598,7 +595,7 @@ class ResponseCache:
     def reading(
         self, allowed: float | None = None, keep: int | None = None, *, is_last: bool = False
     ) -> Reading:
-        """Begin to take derivatives with another allowed error, or another number of responses."""
+        """A new `Reading`, perhaps with another allowed error or number of responses."""
         return Reading(
             self,
             self._relinearise if allowed is None else allowed,
@@ -615,8 +612,8 @@ class ResponseCache:
     ) -> Tensor:
         """Derivative of the image with respect to named parameters, (components, ny, nx).
 
-        `opd` is (npix, npix) on the model's grid, m, and `fields` are the star's at each
-        wavelength. The names must not change between calls.
+        `opd` is (npix, npix) on the model's grid, m, and `fields` are the fields of the star at
+        each wavelength. The names must not change between calls.
         """
         return self.reading().parameters(opd, values, names, fields)
 
@@ -627,7 +624,7 @@ class ResponseCache:
         names: tuple[str, ...],
         slopes: dict[str, list[Tensor]],
     ) -> Tensor:
-        """Derivatives of the image, (components, ny, nx), from those of the field."""
+        """Derivatives of the image, (components, ny, nx), from derivatives of the field."""
         own = [fields[k] for k in self._kept_wavelengths]
         return image_derivatives(self._coarse, own, values, names, slopes)
 
@@ -639,12 +636,12 @@ class ResponseCache:
         allowed: float,
         keep: int,
     ) -> tuple[dict[str, list[Tensor]], float]:
-        """Derivatives of the field by parameters, and their error; see `Reading`."""
+        """Derivatives of the field by parameters, and the error of them; see `Reading`."""
         inside = opd[self.model.entrance.lit]
-        near = self._nearest(self._slopes, inside, values, _TILT_OF_SLOPES, allowed)
+        near = self._nearest(self._slopes, inside, values, _SLOPE_ERROR_PER_RADIAN, allowed)
         if near is not None:
             about, slopes, error = near
-            if self._last_pupil.change(about.now, values) > _UNSEEN:
+            if self._last_pupil.change(about.now, values) > _UNFOLLOWED_RADIANS:
                 for fields in slopes.values():
                     self._last_pupil.multiply(fields, about.now, values)
                 about.now = dict(values)
@@ -657,7 +654,7 @@ class ResponseCache:
     def near(self, opd: Tensor, values: dict[str, Tensor]) -> WavefrontResponse:
         """Return the stored response for nearly the same field, or compute it.
 
-        It follows changes in the last pupil, so that it is right until the next call.
+        The response follows changes in the last pupil, and is right until the next call.
         """
         return self.reading().near(opd, values)
 
@@ -670,12 +667,12 @@ class ResponseCache:
         *,
         stores: bool = True,
     ) -> tuple[WavefrontResponse, float]:
-        """The response for nearly the same field, and its error; see `Reading`."""
+        """The response for nearly the same field, and the error of it; see `Reading`."""
         inside = opd[self.model.entrance.lit]
-        near = self._nearest(self._kept, inside, values, _TILT, allowed)
+        near = self._nearest(self._kept, inside, values, _RESPONSE_ERROR_PER_RADIAN, allowed)
         if near is not None:
             about, response, error = near
-            if self._last_pupil.change(about.now, values) > _UNSEEN:
+            if self._last_pupil.change(about.now, values) > _UNFOLLOWED_RADIANS:
                 response.follow(self._last_pupil, values)
                 about.now = dict(values)
             return response, error
@@ -707,14 +704,14 @@ class ResponseCache:
         tilt: float,
         allowed: float,
     ) -> tuple[_About, _Derivatives, float] | None:
-        """The derivatives with the smallest error, and it, see `_error`, if it is allowed."""
+        """The derivatives with the smallest error, and this error, if `allowed`; see `_error`."""
         errors = [self._error(about, opd, values, tilt) for about, _ in kept]
         if not errors or min(errors) > allowed:
             return None
         return *kept[errors.index(min(errors))], min(errors)
 
     def _make_room(self, size: int) -> None:
-        """Free the oldest responses until as many bytes can be stored."""
+        """Free the oldest responses until `size` bytes can be stored."""
         stored = [response for _, response in self._kept if response.stored]
         while stored and sum(each.size for each in stored) + size > self.memory:
             stored.pop(0).forget()
@@ -722,7 +719,7 @@ class ResponseCache:
     def _error(self, about: _About, opd: Tensor, values: dict[str, Tensor], tilt: float) -> float:
         """Relative error of derivatives that have followed changes in the last pupil.
 
-        `opd` is that inside the pupil, m, and `tilt` the error per radian of tilt, rms over the
+        `opd` is the OPD inside the pupil, m, and `tilt` the error per radian of tilt, rms over the
         pupil.
         """
 
@@ -735,13 +732,13 @@ class ResponseCache:
         lever = wavenumber * ARCSEC * self.model.diameter / 4
         parts = [
             float((wavenumber * (opd - about.opd).abs()).square().mean().sqrt()),
-            _FOLLOWED * self._last_pupil.change(about.values, values),
+            _FOLLOWED_ERROR_PER_RADIAN * self._last_pupil.change(about.values, values),
         ]
         for name, sensitivity in (
             ("star_offset", tilt * lever),
-            ("lyot_shift", _OPENINGS),
-            ("lyot_rotation", _OPENINGS * math.radians(1) / 4),
-            # Where the aberration is in another pupil, derivatives cannot follow it.
+            ("lyot_shift", _FIELD_CHANGE_PER_STOP_DIAMETER),
+            ("lyot_rotation", _FIELD_CHANGE_PER_STOP_DIAMETER * math.radians(1) / 4),
+            # Derivatives cannot follow an aberration in another pupil.
             ("si_zernikes", 0.0 if self._last_pupil.zernikes else wavenumber),
         ):
             parts.append(sensitivity * float(difference(name).norm()))

@@ -30,7 +30,7 @@ from pyklip_diffrender.optics.planes import (
     kernel,
 )
 from pyklip_diffrender.optics.point_sources import PointSources
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics.system import InstrumentSystem, OpticalSystem
 
 __all__ = [
     "JWST_DIAMETER",
@@ -41,6 +41,7 @@ __all__ = [
     "Effect",
     "EntrancePupil",
     "GaussianBlur",
+    "InstrumentSystem",
     "LinearResampling",
     "LyotStop",
     "MatrixFourier",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.io.units import native_float64, to_metres
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,15 @@ class Bandpass:
         total = sum(self.weights)
         object.__setattr__(self, "weights", tuple(w / total for w in self.weights))
 
+    @classmethod
+    def of(cls, wavelengths: Any, weights: Any = None) -> Bandpass:
+        """A bandpass of one or several wavelengths (Quantity or m), by default of equal weights."""
+        waves = np.atleast_1d(to_metres(wavelengths, "wavelength"))
+        shares = np.ones(len(waves)) if weights is None else native_float64(weights)
+        return cls(tuple(waves.tolist()), tuple(np.atleast_1d(shares).tolist()))
+
     def thinned(self, count: int) -> tuple[tuple[int, ...], Bandpass]:
-        """Keep `count` wavelengths, evenly spread, with all weights: indices, and a bandpass."""
+        """Indices of `count` wavelengths, evenly spread, and their bandpass with all weights."""
         total = len(self.wavelengths)
         if count >= total:
             return tuple(range(total)), self
@@ -52,11 +61,11 @@ class Bandpass:
         return tuple(indices.tolist()), Bandpass(tuple(nodes.tolist()), tuple(weights.tolist()))
 
     def condensed(self, count: int) -> Bandpass:
-        """Replace the wavelengths by the `count` nodes of a Gauss quadrature.
+        """A bandpass with the `count` nodes of a Gauss quadrature as wavelengths.
 
         Sums of polynomials in the wavelength up to the order 2 count - 1 stay the same. Broad-band
-        images of a point source are ten times as accurate as with `thinned`, at wavelengths that
-        are not among those of the bandpass.
+        images of a point source are ten times as accurate as with `thinned`, but the nodes are not
+        among the wavelengths of this bandpass.
         """
         if count >= len(self.wavelengths):
             return self
@@ -89,7 +98,7 @@ class Bandpass:
 
     @property
     def width(self) -> float:
-        """From the shortest to the longest wavelength, as a fraction of the mean."""
+        """Longest minus shortest wavelength, as a fraction of the mean."""
         return (max(self.wavelengths) - min(self.wavelengths)) / self.mean_wavelength
 
     @property

@@ -1,4 +1,4 @@
-"""A faster path through a coronagraph with one compact occulter, with the same results."""
+"""A faster propagation through a coronagraph with one compact occulter, with the same results."""
 
 from __future__ import annotations
 
@@ -59,33 +59,34 @@ from pyklip_diffrender.optics.planes import (
 #
 # Wrapping. The FFTs need as many points as there are differences x - c, about twice the detector's.
 # With fewer points, the largest differences, of samples at one edge from cells at the opposite one,
-# are taken for smaller ones on the other side. Little light is on the outer cells, and little is
-# diffracted so far: fields change by 1e-4 (F444W behind MASK335R, 80 x 80 pixels, 128 points rather
-# than 160), and take two thirds of the time. That is enough for derivatives and for the templates
-# of planets, which change by 5e-5, but not for the star.
+# are taken for smaller differences on the other side. Little light is on the outer cells, and
+# little is diffracted so far: fields change by 1e-4 (F444W behind MASK335R, 80 x 80 pixels, 128
+# points rather than 160), and take two thirds of the time. That is enough for derivatives and for
+# the templates of planets, which change by 5e-5, but not for the star.
 #
 # Sampling. The sum over cells equals the integral if the spectrum of 1 - t vanishes at the
 # frequencies that alias onto the band of F[E] F[L], up to (D_E + D_L) / 2 lambda < D / lambda. The
-# spectrum of a mask with an edge does not vanish. It is cut off on a lattice `_FINER` times finer,
-# by a windowed sinc (`_Axis.band_limiting`), before the mask is sampled; a change of 1 - t outside
-# the band does not change A. The propagation plane by plane samples the mask directly.
+# spectrum of a mask with an edge does not vanish, and is cut off on a lattice
+# `_MASK_POINTS_PER_CELL` times finer, by a windowed sinc (`_Axis.band_limiting`), before the mask
+# is sampled; a change of 1 - t outside the band does not change A. The propagation plane by plane
+# samples the mask directly.
 
 DEFAULT_SAMPLING = 2.0
 """Cells per lambda/D by default. The error is 4e-9 of the star's peak at 4.5 um."""
 
-_FINER = 4
+_MASK_POINTS_PER_CELL = 4
 """Points per cell, along each axis, at which the mask is sampled before it is band-limited."""
 
-_ROLL_OFF = 0.06
+_BAND_EDGE_CYCLES_PER_CELL = 0.06
 """Width of the edge of the band, cycles per cell. With at least 2 cells per lambda/D, the band of
 the pupils (0.87 D / lambda) is well below the edge and the band that aliases onto it well above."""
 
-_MARGIN = 4
+_MASK_MARGIN_CELLS = 4
 """Number of cells of the band-limited mask beyond its edge."""
 
-_UNWRAPPED = 0.6
-"""Part of the cells along an axis, the middle ones, from which differences to all samples are
-right where the others may be wrapped."""
+_UNWRAPPED_CELL_SHARE = 0.6
+"""Share of the cells along an axis, in the middle, whose differences to all samples are never
+wrapped."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class _Axis:
         )
         cells = math.ceil(step / finest - 1e-9) if phases == 1 else 1
         spacing = step * phases / cells
-        half = math.ceil(reach / spacing) + _MARGIN
+        half = math.ceil(reach / spacing) + _MASK_MARGIN_CELLS
         return cls(samples, phases, cells, half, spacing, wrapped)
 
     @property
@@ -136,8 +137,8 @@ class _Axis:
     def period(self) -> int:
         """Period of the convolution, in steps between samples of one phase."""
         # There are (count - 1) cells + 2 half + 1 differences x - c. If they may be wrapped, only
-        # those from the middle cells have to be different.
-        cells = math.ceil(_UNWRAPPED * 2 * self.half) if self.wrapped else 2 * self.half
+        # the differences from the middle cells have to be unique.
+        cells = math.ceil(_UNWRAPPED_CELL_SHARE * 2 * self.half) if self.wrapped else 2 * self.half
         needed = (self.count - 1) * self.cells + cells + 1
         return int(next_fast_len(math.ceil(needed / self.cells)))
 
@@ -145,29 +146,29 @@ class _Axis:
     def differences(self) -> range:
         """Differences of samples of a phase from cells, from the first sample and cell, in cells.
 
-        Those that fit in a period; the middle ones if there are more.
+        If there are more than fit in a period, the outer differences are left out.
         """
         every = range(-2 * self.half, (self.count - 1) * self.cells + 1)
         excess = max(0, len(every) - self.period * self.cells)
         return every[excess // 2 : len(every) - (excess + 1) // 2]
 
     def angles(self, first: Tensor) -> Tensor:
-        """The differences, radians, where the first sample of the phase is at `first`."""
+        """Differences, radians, for a phase whose first sample is at `first`."""
         span = self.differences
         offsets = torch.arange(span.start, span.stop, dtype=torch.float64) + self.half
         return first + (offsets * self.spacing).to(first.device)
 
     def band_limiting(self) -> Tensor:
         """Matrix from the mask on a finer lattice to the band-limited mask on the cells."""
-        inside = self.half - _MARGIN
-        fine = torch.arange(-inside * _FINER, inside * _FINER + 1, dtype=torch.float64) / _FINER
+        last = (self.half - _MASK_MARGIN_CELLS) * _MASK_POINTS_PER_CELL
+        fine = torch.arange(-last, last + 1, dtype=torch.float64) / _MASK_POINTS_PER_CELL
         cells = torch.arange(-self.half, self.half + 1, dtype=torch.float64)
         distance = cells[:, None] - fine
-        # sinc passes the frequencies below half a cycle per cell. The transform of the window is
-        # proportional to exp(-(f / _ROLL_OFF)^2): it rounds the edge of the band, and the sum
-        # converges.
-        window = torch.exp(-((math.pi * _ROLL_OFF * distance) ** 2))
-        return torch.sinc(distance) * window / _FINER
+        # sinc passes the frequencies below half a cycle per cell. The window, whose transform is
+        # proportional to exp(-(f / _BAND_EDGE_CYCLES_PER_CELL)^2), rounds the edge of the band and
+        # makes the sum converge.
+        window = torch.exp(-((math.pi * _BAND_EDGE_CYCLES_PER_CELL * distance) ** 2))
+        return torch.sinc(distance) * window / _MASK_POINTS_PER_CELL
 
 
 def _axes(
@@ -195,14 +196,15 @@ def _axes(
 def finest_spacing(
     occulter: CompactOcculter, detector: Detector, wavelength: float, sampling: float
 ) -> float:
-    """Return the smaller spacing of the aligned cells (radians), `sampling` or more a lambda/D."""
+    """The smaller spacing of the aligned cells (radians), `sampling` or more per lambda/D."""
     return min(axis.spacing for axis in _axes(occulter, detector, wavelength, sampling))
 
 
 class OcculterLattice:
     """The cells of an occulter at one wavelength (m), and their convolution to the detector.
 
-    `sampling` is the smallest number of cells per lambda/D; `wrapped` is explained above.
+    `sampling` is the smallest number of cells per lambda/D. With `wrapped`, the largest differences
+    may be wrapped, see the comment at the beginning of this module.
     """
 
     def __init__(
@@ -217,9 +219,10 @@ class OcculterLattice:
         self.shear, self.wavelength = detector.shear, wavelength
         self.x, self.y = _axes(occulter, detector, wavelength, sampling, wrapped)
         x, y = (
-            torch.arange(-n, n + 1, dtype=torch.float64) * (axis.spacing / _FINER / ARCSEC)
+            torch.arange(-n, n + 1, dtype=torch.float64)
+            * (axis.spacing / _MASK_POINTS_PER_CELL / ARCSEC)
             for axis in (self.x, self.y)
-            for n in [(axis.half - _MARGIN) * _FINER]
+            for n in [(axis.half - _MASK_MARGIN_CELLS) * _MASK_POINTS_PER_CELL]
         )
         # 1 - t on the cells, (cells in y, cells in x), times the factor that turns the sum over
         # cells into the field on a sample.
@@ -271,14 +274,14 @@ class OcculterLattice:
                 starts = (self.y.differences.start, self.x.differences.start)
                 rows.append(values.roll(starts, dims=(-2, -1)))
         kernels = torch.stack(rows).unflatten(0, (self.y.phases, self.x.phases))
-        # The inverse transform of a folded spectrum is smaller by this factor.
+        # Folding the spectrum makes its inverse transform larger by this factor.
         return torch.fft.fft2(kernels) / (self.x.cells * self.y.cells)
 
     def convolve(self, light: Tensor, kernel: Tensor) -> Tensor:
         """Field on the samples, (..., samples in y and x), of the light that the mask removes.
 
-        The light is ``focus`` times ``blocked``, (..., cells in y, cells in x), the kernel
-        `kernel`'s.
+        The light is ``focus`` times ``blocked``, (..., cells in y, cells in x), and `kernel` the
+        result of the method of that name.
         """
         x, y = self.x, self.y
         spectrum = torch.fft.fft2(light, s=(y.cells * y.period, x.cells * x.period))
@@ -336,7 +339,7 @@ class ShiftedTransforms:
         self._even, self._odd = (
             torch.view_as_real(each.contiguous()).flatten(-2) for each in (even, -1j * odd)
         )
-        # Of waves with fy >= 0.
+        # Rows for waves with fy >= 0.
         upper = (y - shifts[reach:, None]).flatten()
         rows = kernel(upper, pupil_y[len(pupil_y) // 2 :], wavelength, +1)
         rows = rows.unflatten(0, (-1, len(y)))
@@ -347,8 +350,8 @@ class ShiftedTransforms:
     def at(self, fx: int, fy: slice) -> Tensor:
         """Transforms for waves of +-fx whole cycles along x and +-fy along y, (2, 2, waves, y, x).
 
-        `fy` is a slice of the numbers 0 to `reach`. Per radian; the first axis is the sign of fx,
-        the second that of fy.
+        `fy` is a slice of the numbers 0 to `reach`. The transforms are per radian; the first axis
+        is the sign of fx, the second the sign of fy.
         """
         cosine, sine = self._cosine[fy].flatten(0, 1), self._sine[fy].flatten(0, 1)
         shape = (-1, self._cosine.shape[1], self._even.shape[-1] // 2, 2)
@@ -367,7 +370,7 @@ def _fold(field: Tensor) -> tuple[Tensor, Tensor]:
     half = field.shape[-2] // 2
     upper, lower = field[..., half:, :], field[..., :half, :].flip(-2)
     if field.shape[-2] % 2:
-        # The middle is its own mirror image: it counts once and has no odd part.
+        # The middle is its own mirror image, which counts once and has no odd part.
         middle, above = upper[..., :1, :], upper[..., 1:, :]
         return (
             torch.cat([middle, above + lower], dim=-2),
@@ -389,15 +392,13 @@ class PlaneWaves:
     def fields(self, fx: int, fy: slice) -> Tensor:
         """Fields for waves exp(2 pi i (+-fx xi +- fy eta) / D), (2, 2, waves, ny, nx).
 
-        Parameters and axes are those of `ShiftedTransforms.at`.
+        See `ShiftedTransforms.at` for parameters and axes.
         """
         removed = self.onwards(self.focus.at(fx, fy).mul_(self.blocked))
         return self.direct.at(fx, fy).mul_(self.per_sample).sub_(removed)
 
 
-# Propagation through a coronagraph with one compact occulter, by convolution.
-#
-# All of it are ordinary torch operations, which have derivatives of all kinds.
+# The propagation consists of ordinary torch operations, which have derivatives of all kinds.
 
 
 class LatticeRoute:
@@ -409,7 +410,7 @@ class LatticeRoute:
         behind = planes[self._place + 1 :]
         self._moving = {name for plane in behind for name in plane.parameters} | {"detector_shift"}
         self._lattices: Cache[tuple[float, bool], OcculterLattice] = Cache()
-        # The most recent result at each wavelength, with the parameters that it depends on.
+        # The latest result at each wavelength, with the parameters on which it depends.
         self._stops: Cache[float, tuple[Position, Wavefront]] = Cache()
         self._kernels: Cache[float, tuple[Position, Tensor]] = Cache()
 
@@ -440,7 +441,7 @@ class LatticeRoute:
         )
 
     def lattice(self, wavelength: float, *, wrapped: bool = False) -> OcculterLattice:
-        """The cells at a wavelength; `wrapped` is explained above."""
+        """Cells at a wavelength; see `OcculterLattice` for `wrapped`."""
         return self._lattices.kept(
             (wavelength, wrapped),
             lambda: OcculterLattice(
@@ -473,7 +474,7 @@ class LatticeRoute:
         if "detector_shift" not in values:
             return stop
         # A detector moved by d has its samples at x - d. F[L E](x - d) is the transform of L E
-        # times the tilt of a source at d, and so is that of the kernel F[L].
+        # times the tilt of a source at d; the same holds for the kernel F[L].
         x, y = values["detector_shift"].unbind(-1)
         shift = torch.stack([x, y + self.detector.shear * x], dim=-1) * ARCSEC
         factors = [
@@ -493,7 +494,7 @@ class LatticeRoute:
     def field(self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]) -> Tensor:
         """Propagate from the entrance pupil to the detector's samples.
 
-        `onto` has for every plane the window to pass on (`OpticalSystem.windows`).
+        `onto` has the windows that the planes pass on, see `OpticalSystem.windows`.
         """
         for plane, window in zip(self.planes[: self._place], onto, strict=False):
             wavefront = plane.apply(wavefront, values, window)
@@ -507,7 +508,7 @@ class LatticeRoute:
     def plane_waves(
         self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid], reach: int
     ) -> PlaneWaves | None:
-        """Prepare the propagation of a field times plane waves, up to `reach` cycles along an axis.
+        """Propagation of a field times plane waves of up to `reach` cycles along an axis.
 
         None if there are planes in front of the occulter. The light of the outer cells is wrapped.
         """

@@ -22,7 +22,7 @@ JWST_DIAMETER = 6.603464
 """Circumscribed diameter of the primary, m (stpsf.constants 2.2.0)."""
 
 STAR_RADIUS = 2.0
-"""Radius of a star's image, arcsec: light beyond it is too faint to matter behind a mask."""
+"""Radius of a star's image, arcsec. Light at larger radii is too faint to matter behind a mask."""
 
 
 @dataclass(frozen=True)
@@ -125,13 +125,12 @@ def doubled_samples(
 def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
     """Resample pupil maps (..., n, n) to (..., npix, npix), float64, across the same pupil.
 
-    A map that already has the right size is returned without a copy. ShapeError if the maps are not
-    square.
+    A map of the right size is returned without a copy. ShapeError if the maps are not square.
     """
     if opd.ndim < 2 or opd.shape[-1] != opd.shape[-2] or not opd.size:
         raise ShapeError(
-            f"opd: got shape {opd.shape}, expected square maps, (..., npix, npix), whose sides "
-            "are those of the pupil array. Pad the missing samples with zeros"
+            f"opd: got shape {opd.shape}, expected square maps, (..., npix, npix), as wide as the "
+            "pupil array. Pad the missing samples with zeros"
         )
     count = opd.shape[-1]
     if npix == count:
@@ -156,11 +155,11 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     The area is exact, whatever the grid, and differentiable in the vertices.
     """
     # In units of pixels, let C(i, j) be the covered area of the pixel in row i, column j. By
-    # Green's theorem the area of a polygon is the integral of x dy along its edges, and so is that
-    # of its part to the left of any vertical line, with x cut off there. All edges are cut at the
-    # borders of pixels (`_border_crossings`). A piece in pixel (i, j), from y1 to y2 with its
-    # middle at x = j + f, is straight, so that of the strip between it and the right end of row i
-    # it bounds
+    # Green's theorem the area of a polygon is the integral of x dy along its edges, and the area to
+    # the left of a vertical line is the same integral with x cut off at the line. All edges are cut
+    # at the borders of pixels (`_border_crossings`). A straight piece of an edge in pixel (i, j),
+    # from y1 to y2 with its middle at x = j + f, bounds the strip between the piece and the right
+    # end of row i, which has the area
     #
     #     (y1 - y2) (1 - f)   in the pixel (i, j) itself, a trapezium,
     #     (y1 - y2)           in every pixel (i, j + 1), (i, j + 2), ... to its right,
@@ -171,11 +170,11 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     #     D(i, j) += (y1 - y2) (1 - f),    D(i, j + 1) += (y1 - y2) f,
     #
     # and C(i, j) = D(i, 0) + ... + D(i, j), a cumulative sum (the accumulation buffer of font
-    # rasterisers). The derivative with respect to the vertices is that of the pieces' ends; the
-    # integers i, j are constant except where a vertex crosses a border, where C is continuous.
+    # rasterisers). The derivatives with respect to the vertices come from the ends of the pieces;
+    # the integers i, j are constant except where a vertex crosses a border, where C is continuous.
     rows, columns = grid.shape
     origin = torch.tensor([grid.columns[0], grid.rows[0]], dtype=torch.float64)
-    # All polygons at once: the time goes to the number of operations, above all in derivatives.
+    # All polygons are computed at once, because the number of operations determines the time.
     sizes = torch.tensor([len(polygon) for polygon in polygons])
     owner = torch.repeat_interleave(torch.arange(len(polygons)), sizes)
     first = (sizes.cumsum(0) - sizes)[owner]
@@ -188,7 +187,7 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
 
     edge, fraction = _border_crossings(start, end)
     begin = start[edge] + fraction[:-1, None] * (end - start)[edge]
-    # A piece ends where the next on the same edge begins; the last of an edge ends at 1.
+    # A piece ends where the next piece of its edge begins; the last piece ends at 1.
     last = torch.ones(len(edge), dtype=torch.bool)
     last[:-1] = edge[1:] != edge[:-1]
     stop_fraction = torch.where(last, torch.ones_like(fraction[1:]), fraction[1:])
@@ -197,7 +196,7 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     middle = (begin + finish) / 2
     column, row = torch.floor(middle.detach()).to(torch.int64).unbind(dim=1)
     height = -(finish - begin)[:, 1] * sense[edge]
-    # A piece to the left of the window fills its row, one to the right does not contribute.
+    # A piece to the left of the window fills its row; a piece to the right does not contribute.
     beyond = column < 0
     inside_x = torch.where(beyond, torch.zeros_like(height), middle[:, 0] - column)
     column = column.clamp(0, columns)
@@ -254,14 +253,13 @@ def widen_polygon(polygon: Tensor, distance: float) -> Tensor:
     normal = sense * torch.stack([edge[:, 1], -edge[:, 0]], dim=1)
     normal = normal / normal.norm(dim=1, keepdim=True)
     before = normal.roll(1, dims=0)
-    # A corner moves along the bisector so far that both its edges move by the distance.
+    # A corner moves along the bisector until both edges have moved by the distance.
     bisector = (before + normal) / (1 + (before * normal).sum(dim=1, keepdim=True))
     return polygon + distance * bisector
 
 
-# Noll-ordered Zernike polynomials, normalised to unit rms on the disc.
-#
-# R. J. Noll, "Zernike polynomials and atmospheric turbulence", J. Opt. Soc. Am. 66, 207 (1976).
+# Zernike polynomials are in Noll's order and have unit rms on the disc: R. J. Noll, "Zernike
+# polynomials and atmospheric turbulence", J. Opt. Soc. Am. 66, 207 (1976).
 
 
 def noll_indices(j: int) -> tuple[int, int]:
@@ -277,7 +275,7 @@ def noll_indices(j: int) -> tuple[int, int]:
 def zernike_basis(count: int, x: Tensor, y: Tensor, radius: float) -> Tensor:
     """The first `count` Noll Zernikes on a grid, (count, rows, columns); zero outside the disc.
 
-    `x` is (columns,), `y` (rows,), `radius` that of the disc, all in m. The first is piston.
+    `x` is (columns,), `y` (rows,), `radius` the radius of the disc, all in m. The first is piston.
     """
     # rho^m exp(i m theta) is a power of x + i y: no trigonometry, and smooth at the centre.
     point = torch.complex(*torch.broadcast_tensors(x[None, :] / radius, y[:, None] / radius))
@@ -293,9 +291,9 @@ def zernike_basis(count: int, x: Tensor, y: Tensor, radius: float) -> Tensor:
     for j in range(1, count + 1):
         n, m = noll_indices(j)
         half = (n - abs(m)) // 2
-        # R_n^m(rho) = sum_k (-1)^k C(n - k, k) C(n - 2k, (n - m) / 2 - k) rho^(n - 2k). Here it is
-        # without its factor rho^m, which `waves` has. sqrt(n + 1), and sqrt(2 (n + 1)) for m > 0,
-        # make the rms on the disc 1.
+        # R_n^m(rho) = sum_k (-1)^k C(n - k, k) C(n - 2k, (n - m) / 2 - k) rho^(n - 2k). `radial` is
+        # R without the factor rho^m, which is in `waves`. sqrt(n + 1), and sqrt(2 (n + 1)) for
+        # m > 0, make the rms on the disc 1.
         radial = sum(
             (-1) ** k * comb(n - k, k) * comb(n - 2 * k, half - k) * even[half - k]
             for k in range(half + 1)

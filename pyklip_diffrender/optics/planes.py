@@ -1,4 +1,4 @@
-"""The planes of a coronagraph, from the pupil to the detector, and the transforms between them.
+"""The planes of a coronagraph, from the pupil to the detector, and the transforms in between.
 
 The whole propagation, with xi, eta positions in the pupil (m), x, y angles on the sky (radians),
 F the transform from the pupil to the sky (`optics.planes`), and all fields in the orientation of
@@ -11,8 +11,8 @@ the entrance pupil:
     Ed = F[E3],   I = sum over lambda of w |Ed|^2                  `Detector`, `OpticalSystem`
 
 A is the amplitude of the telescope's pupil, (x0, y0) the star, t the real amplitude transmission of
-the mask, L the stop, W the aberration behind it, w the weight of a wavelength. The mask changes
-light only within its disc, where 1 - t is not zero: F[E0] is needed only there, and computed as a
+the mask, L the stop, W the aberration behind the stop, w the weight of a wavelength. The mask
+changes light only within its disc, where 1 - t is not zero: F[E0] is computed only there, as a
 matrix product (R. Soummer et al., Opt. Express 15, 15935, 2007). Everything behind E0 is linear,
 so that the adjoint of E0 -> Ed is
 g -> (1 - F^-1 (1 - t) F) L exp(-2 pi i W / lambda) F^-1 g.
@@ -21,7 +21,7 @@ With S = L exp(2 pi i W / lambda), the last four lines are one, Ed = F[S E0] - F
 where * is a convolution of small arrays: `optics.fast_path` computes that.
 
 A plane maps one `Wavefront` to the next. Values of free parameters are passed by name; a plane uses
-those that it declares in `parameters`.
+the parameters that are named in its attribute `parameters`.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ class Cache(dict[Key, Made]):
     """Constants by key, each made once. Copies by `pickle` and `copy.deepcopy` are empty.
 
     Nothing is stored within a transform of `torch.func`, which wraps all results: wrapped tensors
-    cannot be copied or written after it has ended.
+    cannot be copied or written after the transform has ended.
     """
 
     def kept(self, key: Key, make: Callable[[], Made]) -> Made:
-        """The constant for a key, which `make` makes if there is none yet."""
+        """The constant for a key, which `make` makes if the key is new."""
         made = self.get(key)
         if made is None:
             self[key] = made = make()
@@ -96,7 +96,7 @@ def is_plain(tensor: Tensor) -> bool:
 
 
 def position_of(values: Mapping[str, Tensor], names: Iterable[str]) -> Position | None:
-    """Values of the named parameters, or None if one of them is being differentiated.
+    """Values of the named parameters, or None if a parameter is being differentiated.
 
     Names without a value are omitted.
     """
@@ -114,7 +114,7 @@ def cached(
     position: Position | None,
     make: Callable[[], Made],
 ) -> Made:
-    """The stored result for a key if it was made at the same position, else a new one.
+    """The stored result for a key if it was made at the same position, else a new result.
 
     Only the latest result for each key is stored. Nothing is stored while differentiating (position
     None, see `position_of`), nor within a transform of `torch.func`, see `Cache`.
@@ -127,10 +127,9 @@ def cached(
     return latest[1]
 
 
-# Fraunhofer propagation between pupil and image by matrix products.
-#
-# Convention, with x, y angles on the image (radians, image orientation as in stpsf) and xi, eta
-# positions in the entrance-pupil orientation (m),
+# Fraunhofer propagation between pupil and image by matrix products has the convention, with x, y
+# angles on the image (radians, image orientation as in stpsf) and xi, eta positions in the
+# entrance-pupil orientation (m),
 #
 #     E(x, y) = 1/lambda  sum  E(xi, eta) exp(+2 pi i (x xi - y eta) / lambda) d_xi d_eta
 #
@@ -206,8 +205,6 @@ class MatrixFourier:
         return (columns if self._shear is None else columns * self._shear.conj()) @ self._columns.mH
 
 
-# The planes of a coronagraph: pupils, the compact occulter, internal aberrations.
-
 Values = Mapping[str, Tensor]
 
 
@@ -224,24 +221,27 @@ class Plane(ABC):
     """A plane of an `OpticalSystem` behind the entrance pupil; linear in the field."""
 
     name: str
-    # Names of the free parameters that it uses.
+    # Names of the free parameters of this plane.
     parameters: tuple[str, ...] = ()
     # True for a mask in a focus, False for an optic in a pupil.
     focal: bool = False
-    # True if it multiplies each sample of the field in the pupil by a factor that does not depend
-    # on the field.
+    # True if the plane multiplies each sample of the field in the pupil by a factor that does not
+    # depend on the field.
     pointwise: bool = False
-    # True if it is known only at the wavelengths that it was made for.
+    # True if the plane is known only at the wavelengths for which it was made.
     sampled: bool = False
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name!r}, {'image' if self.focal else 'pupil'} plane>"
+
     def window(self, values: Values) -> PupilGrid | None:
-        """Return the part of the pupil that this plane passes on; None for all of it."""
+        """Window of the pupil that this plane passes on; None for the whole pupil."""
         return None
 
     def compact(
         self, wavelength: float, dtype: torch.dtype, device: torch.device
     ) -> CompactOcculter | None:
-        """Return a focal mask as one compact occulter at a wavelength; None if it is not one."""
+        """A compact occulter that acts as this plane at a wavelength; None if there is none."""
         return None
 
     @abstractmethod
@@ -264,7 +264,7 @@ class EntrancePupil:
 
     parameters: tuple[str, ...] = ("star_offset",)
     sampled: bool = False
-    """True if it is known only at the wavelengths that it was made for."""
+    """True if the pupil is known only at the wavelengths for which it was made."""
     opd: Tensor | None = None
     """The OPD for calls without one, (npix, npix) in m; None for a flat wavefront."""
 
@@ -282,6 +282,9 @@ class EntrancePupil:
         self.amplitude = full.crop(amplitude / torch.sqrt(power), self.grid).to(dtype)
         self.lit = amplitude > 0
         """Samples that transmit light, (npix, npix)."""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name!r}, {self.full.npix} px pupil>"
 
     def on_window(self, maps: Tensor) -> Tensor:
         """OPD maps (..., npix, npix) on the samples of the field, (..., rows, columns)."""
@@ -491,17 +494,14 @@ class CompactOcculter(Plane):
         return replace(wavefront, field=field, grid=onto)
 
 
-# The pixel array: sampling of the field, and pixel values from the samples.
-
-
-@dataclass
+@dataclass(repr=False)
 class Detector:
     """The pixel array."""
 
     shape: tuple[int, int]  # (ny, nx) pixels
     pixelscale: tuple[float, float]  # x, y, arcsec per pixel
-    # Samples per pixel along each axis. A pixel's value is the mean of its samples times the
-    # pixel's area, so with 1 it is the intensity at the pixel's centre.
+    # Samples per pixel along each axis. The value of a pixel is the mean of its samples times the
+    # area of the pixel: with one sample, the intensity at the centre of the pixel.
     oversample: int
     dtype: torch.dtype
     device: torch.device
@@ -513,6 +513,10 @@ class Detector:
     _transforms: Cache[tuple[float, PupilGrid], MatrixFourier] = field(
         default_factory=Cache, init=False, repr=False, compare=False
     )
+
+    def __repr__(self) -> str:
+        (ny, nx), scale = self.shape, self.pixelscale[0]
+        return f"<{type(self).__name__} {self.name!r}, {nx} x {ny} px of {scale:.4g} arcsec>"
 
     def axes(self, values: Values) -> tuple[Tensor, Tensor]:
         """Sample positions x, y on the image relative to the optical axis, radians."""
@@ -539,8 +543,7 @@ class Detector:
                 self.shear,
             )
 
-        # The transform to a detector that is shifted holds for one shift, which may need a
-        # derivative.
+        # The transform to a shifted detector holds for one shift, which may need a derivative.
         key = (wavefront.wavelength, wavefront.grid)
         moved = "detector_shift" in values
         transform = make() if moved else self._transforms.kept(key, make)
@@ -548,7 +551,7 @@ class Detector:
 
     @property
     def per_sample(self) -> float:
-        """Square root of a sample's solid angle, radians: the field on it per field per radian."""
+        """Square root of the solid angle of a sample, radians: field on the sample per radian."""
         return math.sqrt(self.pixelscale[0] * self.pixelscale[1]) * ARCSEC / self.oversample
 
     def image(self, intensity: Tensor, values: Values) -> Tensor:
@@ -581,7 +584,7 @@ def _blur(image: Tensor, sigma: Tensor, axis: int) -> Tensor:
 def mirrored_convolution(kernel: Tensor, count: int) -> Tensor:
     """Matrix (count, count) of the convolution with a symmetric kernel, mirrored at the edges."""
     # Mirrored about the outer border of the edge pixel, with a period of 2 count: the sample before
-    # 0 is 0 again, that after count - 1 is count - 1 (scipy's "reflect").
+    # sample 0 is sample 0 again, and sample count - 1 follows itself (scipy's "reflect").
     reach, device = len(kernel) // 2, kernel.device
     lag = torch.arange(-reach, reach + 1, device=device)
     folded = (torch.arange(count, device=device)[:, None] + lag) % (2 * count)
@@ -590,10 +593,8 @@ def mirrored_convolution(kernel: Tensor, count: int) -> Tensor:
     return matrix.scatter_add(1, mirrored, kernel.expand(count, -1))
 
 
-# Detector effects as linear, differentiable torch functions: blur, geometry, crosstalk.
-#
-# Each follows the numerics of stpsf, with kernels cut as in scipy, so that chains of them agree
-# with stpsf to rounding.
+# Detector effects are linear, differentiable torch functions. They follow the numerics of stpsf,
+# with kernels cut as in scipy, so that chains of effects agree with stpsf to rounding.
 
 Effect = Callable[[Tensor], Tensor]
 
@@ -666,8 +667,8 @@ class LinearResampling:
 class PixelCrosstalk:
     """Convolution of pixels with a small `kernel` (odd, odd), scaled to sum 1 (IPC, PPC).
 
-    The kernel is the distribution of the signal of the middle pixel; beyond the edges there is
-    none.
+    The kernel is the distribution of the signal of the middle pixel. There is no signal beyond the
+    edges.
     """
 
     def __init__(self, kernel: ArrayLike) -> None:
@@ -685,7 +686,7 @@ class PixelCrosstalk:
         return torch.nn.functional.conv2d(images, turned, padding=padding).reshape(image.shape)
 
 
-@dataclass
+@dataclass(repr=False)
 class ChainDetector(Detector):
     """A detector with effects, in order, before and after the samples are binned to pixels."""
 

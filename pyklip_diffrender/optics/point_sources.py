@@ -39,32 +39,33 @@ from pyklip_diffrender.optics.planes import (
     Plane,
     Wavefront,
 )
-from pyklip_diffrender.optics.system import OpticalSystem, Value, batch_of
+from pyklip_diffrender.optics.propagation import Value, batch_of
+from pyklip_diffrender.optics.system import OpticalSystem
 
 Index = ArrayLike | Tensor
 
 _log = logging.getLogger(__name__)
 
-_NEAR = 0.15
-"""Fraction of the occulter's radius within which sources are computed in double precision. There
-the light is suppressed a thousandfold, and the error of single precision is 4e-6 of the image."""
+_DOUBLE_PRECISION_MASK_RADII = 0.15
+"""Fraction of the mask's radius within which sources are computed in double precision. The mask
+suppresses their light a thousandfold, and the error of single precision is 4e-6 of the image."""
 
-_ALIKE = 0.01
-"""Largest relative rms difference from the images of the model at which the outer parts of a mask,
-or all of it, are ignored. An error of a percent of a planet's template costs 5e-5 of its S/N."""
+_IMAGE_DIFFERENCE_RMS = 0.01
+"""Largest relative rms difference from the images of the model for which the mask, or its outer
+parts, are ignored. An error of a percent in a planet's template costs 5e-5 of the S/N."""
 
-_TESTED = 12
-"""Number of sources just beyond the mask with which it is decided whether to ignore it there."""
+_TESTED_SOURCES = 12
+"""Number of sources just outside the mask whose images decide whether to ignore the mask there."""
 
 
 class PointSources:
     """Images of point sources at the centres of detector pixels, many at a time.
 
     `opd` (npix, npix) in m and `values` are as in a call of the model, but a ``star_offset`` is
-    ignored: the positions are the pixels', moved by `offset`, x, y in arcsec. `sampling` is the
-    smallest number of cells of the occulter per lambda/D. With `wrapped`, the light of the mask's
-    outer parts may wrap around the detector (`optics.fast_path`): images change by up to 5e-5, and
-    take two thirds of the time.
+    ignored: sources are at the pixels, moved by `offset`, x, y in arcsec. `sampling` is the
+    smallest number of cells of the occulter per lambda/D. With `wrapped`, the light of the outer
+    parts of the mask may wrap around the detector (`optics.fast_path`): images change by up to
+    5e-5, and take two thirds of the time.
     """
 
     def __init__(
@@ -86,10 +87,10 @@ class PointSources:
                 raise ShapeError(f"opd: got shape {tuple(self._opd.shape)}, expected one map")
             self._values = {name: value.detach() for name, value in model.values(fixed).items()}
             # `route` is "lattice", or "model" where images are calls of the model: if the planes
-            # are not one mask between pupil planes, or if a mask of several parts reduced to the
-            # first one changes the images of a few test sources by more than a percent. `reach`
+            # are not one mask between pupil planes, or if leaving out all parts of a mask but the
+            # first changes the images of a few test sources by more than a percent. `reach`
             # (arcsec) is the distance from the axis beyond which the mask is ignored, because it
-            # changes images by a percent at most: they are then the same but for a shift, and cost
+            # changes images by a percent at most. These images differ by a shift alone, and cost
             # next to nothing.
             self._radius, self.reach, self._reduced = 0.0, math.inf, False
             self._waves = self._prepared(sampling)
@@ -100,20 +101,20 @@ class PointSources:
         _log.debug("images of point sources: method %r", self.route)
 
     def _prepared(self, sampling: float) -> list[_Wave]:
-        """Prepare all wavelengths; an empty list if `_one_mask` returns None."""
+        """Transforms at all wavelengths; an empty list if `_one_mask` returns None."""
         waves = []
         for wavelength in self.model.bandpass.wavelengths:
             planes = _one_mask(self.model, wavelength)
             if planes is None:
                 return []
-            self._reduced |= planes != list(self.model.planes)
+            self._reduced |= planes != list(self.model.between)
             masks = [plane.radius for plane in planes if isinstance(plane, CompactOcculter)]
             self._radius = max(self._radius, *masks, 0.0)
             waves.append(self._wave(planes, wavelength, sampling))
         return waves
 
     def _agrees(self) -> bool:
-        """Whether images agree with those of the model, between the middle and a corner."""
+        """Whether images agree with calls of the model, between the middle and a corner."""
         if self.route == "model" or not self._reduced:
             return True
         ny, nx = self.model.detector.shape
@@ -121,7 +122,7 @@ class PointSources:
         rows, columns = ((share * (n - 1)).round().to(torch.int64) for n in (ny, nx))
         exact = self.model(self._opd, self.positions(rows, columns), **self._values).double()
         away = (self.images(rows, columns).double() - exact).flatten(1).norm(dim=1)
-        return bool((away <= _ALIKE * exact.flatten(1).norm(dim=1)).all())
+        return bool((away <= _IMAGE_DIFFERENCE_RMS * exact.flatten(1).norm(dim=1)).all())
 
     def _reach(self) -> float:
         """The radius of the mask if the mask can be ignored beyond it, else infinity."""
@@ -131,7 +132,7 @@ class PointSources:
         rows, columns = torch.unravel_index(torch.arange(ny * nx), (ny, nx))
         distances = self.positions(rows, columns).norm(dim=-1).cpu()
         nearest = distances.argsort()
-        nearest = nearest[distances[nearest] > self._radius][:_TESTED]
+        nearest = nearest[distances[nearest] > self._radius][:_TESTED_SOURCES]
         if not len(nearest):
             return math.inf
         # A mask with a sharp edge changes images far beyond it.
@@ -139,7 +140,7 @@ class PointSources:
             self._batch_of_images(rows[nearest], columns[nearest], False, masked).flatten(1)
             for masked in (True, False)
         )
-        alike = ((plain - exact).norm(dim=1) <= _ALIKE * exact.norm(dim=1)).all()
+        alike = ((plain - exact).norm(dim=1) <= _IMAGE_DIFFERENCE_RMS * exact.norm(dim=1)).all()
         return self._radius if bool(alike) else math.inf
 
     def _wave(self, planes: Sequence[Plane], wavelength: float, sampling: float) -> _Wave:
@@ -150,9 +151,9 @@ class PointSources:
         ones = torch.ones((), dtype=model.dtype.to_complex(), device=model.device)
         stop = Wavefront(ones.expand(front.grid.shape), wavelength, front.grid)
         occulter = None
-        # Up to the occulter, planes act on the field of the source; those behind it are multiplied
-        # to one, because the kernel is the transform of their product. Without an occulter all act
-        # on the field.
+        # Planes up to the occulter act on the field of the source. Planes behind the occulter are
+        # multiplied, because the kernel is the transform of their product. Without an occulter, all
+        # planes act on the field.
         for plane, onto in zip(planes, windows, strict=True):
             if isinstance(plane, CompactOcculter):
                 occulter = plane
@@ -179,7 +180,7 @@ class PointSources:
     def images(self, rows: Index, columns: Index) -> Tensor:
         """Images of point sources in pixels `rows`, `columns`, (k,) each: (k, ny, nx), float32.
 
-        They are ``model(opd, star_offset=position, **values)``: light per detector pixel as a
+        The images are ``model(opd, star_offset=position, **values)``: light per detector pixel as a
         fraction of the light that the pupil collects. ShapeError for pixels that are not on the
         detector.
         """
@@ -211,7 +212,7 @@ class PointSources:
     def _needs_double(self, distances: Tensor) -> Tensor:
         """Whether sources at distances from the axis need double precision, (k,)."""
         radius = self._radius if self.model.dtype == torch.float64 else 0.0
-        return distances < _NEAR * radius
+        return distances < _DOUBLE_PRECISION_MASK_RADII * radius
 
     def _batch(self, double: bool) -> int:
         if self.route == "lattice":
@@ -233,12 +234,12 @@ class PointSources:
 
 
 def _one_mask(model: OpticalSystem, wavelength: float) -> list[Plane] | None:
-    """Replace focal masks by compact occulters.
+    """Planes of a model with compact occulters in place of the focal masks.
 
-    Returns None unless the planes are at most one mask between factors in the pupil.
+    None unless the planes are at most one mask between factors in the pupil.
     """
     planes: list[Plane] = []
-    for plane in model.planes:
+    for plane in model.between:
         each: Plane | None = plane
         if plane.focal:
             each = plane.compact(wavelength, model.dtype, model.device)
@@ -254,8 +255,8 @@ class _Wave:
     """Transforms on parts of the lattice at one wavelength.
 
     `front` is the field in front of the occulter for a source on the axis, `stop` the product of
-    all planes behind it, `axes` the sample positions x, y in radians; the rest as in
-    `PointSources`.
+    all planes behind the occulter, `axes` the sample positions x, y in radians. See `PointSources`
+    for `sampling` and `wrapped`.
     """
 
     def __init__(
@@ -270,7 +271,8 @@ class _Wave:
     ) -> None:
         self._shape, self._oversample = detector.shape, detector.oversample
         counts = detector.shape[::-1]
-        # Samples minus sources: from the last source's first sample to the first one's last.
+        # Samples minus sources, from the first sample of the last source to the last sample of the
+        # first source.
         k = detector.oversample
         differences = [
             (torch.arange(k * (2 * n - 1), dtype=torch.float64) - (k * (n - 0.5) - 0.5))
@@ -316,8 +318,8 @@ class _Wave:
         """Add the weighted intensities of sources to `total`, (k, samples in y, samples in x)."""
         k = self._oversample
         ny, nx = self._shape
-        # The tables start with the differences from the last pixel's source, so that the window of
-        # pixel (r, c) starts ny - 1 - r pixels further up and nx - 1 - c further right.
+        # The tables start with the differences from the source in the last pixel. The window of
+        # pixel (r, c) therefore starts ny - 1 - r pixels further up and nx - 1 - c further right.
         up, left = ny - 1 - rows, nx - 1 - columns
         direct, *occulted = self._tables[total.dtype]
         field = _cut(direct, up * k, left * k, (ny * k, nx * k))
