@@ -327,7 +327,7 @@ def test_a_single_star_needs_no_name(tmp_path):
     another(tmp_path, cards=cards)
     assert dr.Sequence.from_files(tmp_path).target == "x.fits"
     another(tmp_path, "y.fits", observation=9, date="2022-10-03T14:00:00", cards=cards)
-    with pytest.raises(IncompatibleSetupError, match=r"x\.fits, y\.fits do not say"):
+    with pytest.raises(NoValidPixelsError, match=r"x\.fits, y\.fits: .*does not say which star"):
         dr.Sequence.from_files(tmp_path)
 
 

@@ -7,7 +7,7 @@ pointing of the telescope.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from astropy import units as u
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter, map_coordinates, shift, uniform_filter
 from scipy.stats import median_abs_deviation
 
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.scene.admission import FrameFile, admissible
+from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.scene.integrations import dark_pixels
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symmetry, stamp_about
@@ -455,39 +454,3 @@ def _noise(observation: Observation, *, clipped: bool = True) -> tuple[Image, ND
     if typical > 0 and clipped:
         difference = np.clip(difference / typical, -6, 6)
     return difference, usable
-
-
-# Exclude frames by their pixels.
-
-
-def exclude_contradicting(
-    files: Iterable[FrameFile],
-    why: Callable[[Sequence[Observation]], Mapping[int, str]],
-) -> None:
-    """Exclude frames, of files that were read, that contradict the others.
-
-    `why` gives reasons by index, such as `why_turned`. IncompatibleSetupError if half
-    of the target's frames or more have one, and nothing says which are right.
-    """
-    usable = admissible(files)
-    odd = why([_frames(each) for each in usable])
-    if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
-        names = ", ".join(each.name for each in usable)
-        raise IncompatibleSetupError(
-            f"{names} contradict each other: for {usable[min(odd)].name}, {odd[min(odd)]}. Leave "
-            "out those that are wrong, or correct them"
-        )
-    for k, reason in odd.items():
-        usable[k].reason = reason
-
-
-def exclude_copies(files: Iterable[FrameFile]) -> None:
-    """Exclude frames whose pixels are those of another file, whatever the headers say."""
-    usable = admissible(files)
-    for k, j in copies([_frames(each) for each in usable]).items():
-        usable[k].reason = f"its pixels are those of {usable[j].name}: a copy of the exposure"
-
-
-def _frames(file: FrameFile) -> Observation:
-    assert file.observation is not None  # A file that could not be read has a reason.
-    return file.observation
