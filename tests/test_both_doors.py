@@ -25,7 +25,7 @@ from pyklip_diffrender.pattern.library import package_library
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.refinement import GaussNewton, Refinement, fitting
 from pyklip_diffrender.scene import frame_file
-from pyklip_diffrender.scene.jwst_files import shift_frames
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.surveys import execution, jobs

@@ -216,9 +216,6 @@ class FreeRotation(Plane):
         return replace(wavefront, field=self._full.crop(field, onto), grid=onto)
 
 
-# Planes made from sampled arrays in any orientation.
-
-
 class OrientedPupil(EntrancePupil):
     """An entrance pupil in any frame, with a wavefront and a pointing of its own.
 

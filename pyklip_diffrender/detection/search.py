@@ -145,8 +145,6 @@ def _chi2(fits: Sequence[Refinement]) -> float:
     return float(np.mean([fit.chi2_per_pixel for fit in of_target]))
 
 
-# Search for point sources in refined frames.
-
 Fits = Refinement | Sequence[Refinement]
 
 

@@ -27,10 +27,11 @@ from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, NoValidP
 from pyklip_diffrender.io.files import open_fits, read_image
 from pyklip_diffrender.io.headers import fits_text, header_number, merged_header
 from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.scene.aligned_frames import SHIFTS
 from pyklip_diffrender.scene.exposure import beginning, middle
 from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.integrations import pointings
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, SHIFTS, single_precision, unflagged
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, single_precision, unflagged
 from pyklip_diffrender.scene.observation import Observation, frames_in
 from pyklip_diffrender.scene.sequence import Sequence
 
