@@ -23,7 +23,6 @@ from pyklip_diffrender.scene.pixel_checks import (
     why_no_star,
     why_odd_unit,
 )
-from pyklip_diffrender.scene.simulation import images_of_stars
 
 _SENSED = "RESULT_PHASE"
 """Extension of wavefront-sensing files of MAST."""
@@ -97,7 +96,7 @@ class FrameFile:
             or why_odd_noise(frames.noise_ratios)
             or why_odd_unit(frames)
             # Where the user has stated the star's position, it is not judged whether it is there.
-            or ("" if self.place is not None else why_no_star(frames, images_of_stars))
+            or ("" if self.place is not None else why_no_star(frames))
         )
 
     @property

@@ -214,13 +214,9 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
     ]  # fmt: skip
     angle = position_angle(header, name)
     area = number("PIXAR_A2", 0.0)
-    if area == 0:
-        raise UnitError(f"{name}: the header has no PIXAR_A2 (pixel area, arcsec^2)")
-    if area < 0:
-        raise CorruptFileError(
-            f"{name}: PIXAR_A2 is {area}, expected a pixel area in arcsec^2, such as 0.0039. "
-            "Correct the header, or fetch the file again"
-        )
+    if area <= 0:
+        expected = "the area of a pixel in arcsec^2, such as 0.0039"
+        raise card_error(name, "PIXAR_A2", area or None, expected)
     solid, by_area = number("PIXAR_SR", 0.0), area * ARCSEC**2
     if solid and not 0.9 < solid / by_area < 1.1:
         raise card_error(name, "PIXAR_SR", solid, f"about {by_area:.3g} sr, by PIXAR_A2")
@@ -228,10 +224,8 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
     if detector.startswith("NRC"):
         usual = _SCALES[detector.endswith(("LONG", "5"))]
         if not 0.9 < area**0.5 / usual < 1.1:
-            raise CorruptFileError(
-                f"{name}: by PIXAR_A2 a pixel is {area**0.5:.3g} arcsec wide, and {usual:g} in "
-                f"{detector}. Correct the header, or fetch the file again"
-            )
+            expected = f"about {usual**2:.2g} arcsec^2, the area of a pixel of {detector}"
+            raise card_error(name, "PIXAR_A2", area, expected)
     return {
         "unit": unit,
         "pixelscale": area**0.5,

@@ -18,6 +18,7 @@ from scipy.stats import median_abs_deviation
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.scene.integrations import dark_pixels
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.simulation import images_of_stars
 from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symmetry, stamp_about
 
 Image = NDArray[np.float64]
@@ -111,11 +112,6 @@ _SYMMETRIES: dict[str, Callable[[Image], Image]] = {
 _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 
 
-Images = Callable[[Observation, float, float], tuple[Image, Image]]
-"""Images of a star behind the mask and of a source at a distance (arcsec) from it, as far as
-another distance (arcsec) about the source, such as `scene.simulation.images_of_stars`."""
-
-
 def why_few_pixels(observation: Observation) -> str:
     """Why the pixels about the star's position say nothing about the star; empty if they do."""
     ny, nx = observation.shape
@@ -146,10 +142,10 @@ def not_judged(observation: Observation) -> str:
     )
 
 
-def why_no_star(observation: Observation, images: Images) -> str:
+def why_no_star(observation: Observation) -> str:
     """Why these cannot be frames of a star behind the mask; empty if they can.
 
-    They are compared with `images` where another source hides the star. Frames that are too small
+    They are compared with the model where another source hides the star. Frames that are too small
     (1.2 arcsec about the star) are not judged.
     """
     stamp = _stamp(observation)
@@ -184,7 +180,7 @@ def why_no_star(observation: Observation, images: Images) -> str:
         return ""
     if np.hypot(*(center_of_pattern(light, distance) * scale)) <= _PATTERN_BEHIND:
         return ""
-    contrast = _contrast_of_source(observation, images)
+    contrast = _contrast_of_source(observation)
     if contrast < _AS_BRIGHT:
         return ""
     x, y = away
@@ -207,10 +203,10 @@ _INSIST = (
 )
 
 
-def _contrast_of_source(observation: Observation, images: Images) -> float:
+def _contrast_of_source(observation: Observation) -> float:
     """Least contrast of the brightest point source beside the star; infinite if it is not one."""
     try:
-        star, source = images(observation, _CORE, _SOURCE)
+        star, source = images_of_stars(observation, _CORE, _SOURCE)
     except DiffrenderError:
         return np.inf
     scale = float(np.mean(observation.pixelscale))
