@@ -154,6 +154,28 @@ def test_one_exposure_is_used_once(folder):
     }  # fmt: skip
 
 
+def test_of_an_exposure_the_best_file_whose_pixels_are_a_stars_is_used(folder):
+    good = folder / FIRST.replace("calints", "cal")
+    with fits.open(folder / FIRST) as hdus:
+        for name in ("SCI", "ERR", "DQ"):
+            hdus[name].data = hdus[name].data[0]
+        hdus.writeto(good)
+    with fits.open(folder / FIRST, mode="update") as hdus:
+        hdus["SCI"].data *= -1
+    sequence = dr.Sequence.from_files(folder)
+    assert uses(sequence)[good.name] == "target"
+    assert "negative" in reasons(sequence)[FIRST]
+
+
+def test_what_one_filter_leaves_out_another_one_uses(folder):
+    another(folder, "other.fits", cards={"FILTER": "F356W"})
+    long, short = dr.Sequence.by_filter_and_epoch(folder, target="HD 1")
+    assert as_before(long)
+    assert [each.name for each in short.science] == ["other.fits"]
+    assert reasons(long) == {"other.fits": "taken through F356W, not F444W"}
+    assert set(reasons(short)) == {FIRST, SECOND, THIRD}
+
+
 def test_a_copy_is_seen_whatever_its_header_says(folder):
     with fits.open(folder / SECOND) as hdus:
         hdus[0].header.update({"OBSERVTN": "012", "DATE-BEG": "2022-10-03T10:00:00"})

@@ -504,6 +504,7 @@ def _contradicting(files: Sequence[FrameFile], odd: Mapping[int, str]) -> Reason
 
 
 def _frames(files: Sequence[FrameFile]) -> list[Observation]:
+    """Frames of files that were judged, all of which have some."""
     return [each.observation for each in files if each.observation is not None]
 
 
