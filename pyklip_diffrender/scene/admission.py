@@ -39,13 +39,10 @@ _NOT_USABLE = {
     "psfstack": "a stack of reference stars (psfstack)",
 }
 
-
 _OTHER_TYPES = {
     "NRC_TACQ": "an image for acquiring the target",
     "NRC_TACONFIRM": "an image that confirms the acquisition of the target",
     "NRC_IMAGE": "an image without a coronagraph",
-    "MIR_TACQ": "an image for acquiring the target",
-    "MIR_TACONFIRM": "an image that confirms the acquisition of the target",
 }
 
 
