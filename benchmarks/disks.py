@@ -25,7 +25,7 @@ from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.drawing import compass, halo, light_norm, save
 from pyklip_diffrender.reduction.klip import KlipSubtraction, klip_curve
-from pyklip_diffrender.scene.jwst_files import shift_frames
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 
 Image = NDArray[np.float64]
 

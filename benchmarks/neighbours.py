@@ -35,7 +35,7 @@ import pyklip_diffrender as dr
 from benchmarks.provenance import provenance
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.files import write_table
-from pyklip_diffrender.scene.jwst_files import shift_frames
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 
 NAMES = "jw0118400[56]001_03106_*calints.fits*"
 ANGLE = 110.0

@@ -71,8 +71,6 @@ def _lanczos(distance: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
-# The posterior mean of the sky about a star, from all frames of a fit together.
-
 Image = NDArray[np.float64]
 
 Light = Sequence[Mapping[int, Tensor]]

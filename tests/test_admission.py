@@ -100,7 +100,7 @@ EXCLUDED = [
     ("mas.fits", {"XOFFSET": 15.0, "YOFFSET": -10.0}, "milliarcseconds"),
     ("pup.fits", {"PUPIL": "CLEAR"}, "PUPIL is CLEAR"),
     ("two.fits", {"CORONMSK": "MASKA430R"}, "CORONMSK MASKA430R.*name different masks"),
-    ("area.fits", {"PIXAR_A2": 0.00096}, "^by PIXAR_A2 .*0.063 in NRCALONG"),
+    ("area.fits", {"PIXAR_A2": 0.00096}, "^PIXAR_A2 is 0.00096, expected about 0.004 .*NRCALONG"),
     ("steradian.fits", {"PIXAR_SR": 0.0039}, "^PIXAR_SR is 0.0039, expected about 9.17e-14 sr"),
     ("old.fits", {"DATE-BEG": "2012-01-01"}, "^the exposure.*the launch"),
     ("mid.fits", {"EXPMID": 59000.5}, "EXPMID is 59000.5, expected about"),
@@ -152,6 +152,28 @@ def test_one_exposure_is_used_once(folder):
     assert {reason.split(" as ")[0] for _, reason in sequence.excluded} <= {
         "the same file", "the same exposure",
     }  # fmt: skip
+
+
+def test_of_an_exposure_the_best_file_whose_pixels_are_a_stars_is_used(folder):
+    good = folder / FIRST.replace("calints", "cal")
+    with fits.open(folder / FIRST) as hdus:
+        for name in ("SCI", "ERR", "DQ"):
+            hdus[name].data = hdus[name].data[0]
+        hdus.writeto(good)
+    with fits.open(folder / FIRST, mode="update") as hdus:
+        hdus["SCI"].data *= -1
+    sequence = dr.Sequence.from_files(folder)
+    assert uses(sequence)[good.name] == "target"
+    assert "negative" in reasons(sequence)[FIRST]
+
+
+def test_what_one_filter_leaves_out_another_one_uses(folder):
+    another(folder, "other.fits", cards={"FILTER": "F356W"})
+    long, short = dr.Sequence.by_filter_and_epoch(folder, target="HD 1")
+    assert as_before(long)
+    assert [each.name for each in short.science] == ["other.fits"]
+    assert reasons(long) == {"other.fits": "taken through F356W, not F444W"}
+    assert set(reasons(short)) == {FIRST, SECOND, THIRD}
 
 
 def test_a_copy_is_seen_whatever_its_header_says(folder):
@@ -327,7 +349,7 @@ def test_a_single_star_needs_no_name(tmp_path):
     another(tmp_path, cards=cards)
     assert dr.Sequence.from_files(tmp_path).target == "x.fits"
     another(tmp_path, "y.fits", observation=9, date="2022-10-03T14:00:00", cards=cards)
-    with pytest.raises(IncompatibleSetupError, match=r"x\.fits, y\.fits do not say"):
+    with pytest.raises(NoValidPixelsError, match=r"x\.fits, y\.fits: .*does not say which star"):
         dr.Sequence.from_files(tmp_path)
 
 

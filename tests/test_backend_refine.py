@@ -26,7 +26,7 @@ from pyklip_diffrender.pyklip_backend import (
 )
 from pyklip_diffrender.pyklip_backend.output_files import on_product, throughput_map
 from pyklip_diffrender.refinement import GaussNewton, refine
-from pyklip_diffrender.scene.jwst_files import shift_frames
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.systematics import Systematics

@@ -24,8 +24,8 @@ from pyklip_diffrender.pattern import PatternLibrary
 from pyklip_diffrender.pattern.library import package_library
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.refinement import GaussNewton, Refinement, fitting
-from pyklip_diffrender.scene import sequence
-from pyklip_diffrender.scene.jwst_files import shift_frames
+from pyklip_diffrender.scene import frame_file
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.surveys import execution, jobs
@@ -297,11 +297,12 @@ def test_files_are_opened_twice_at_most_and_judged_once(door, light, tmp_path, c
 
     monkeypatch.setattr(Path, "open", count_path)
     monkeypatch.setattr(fits, "open", count_open)
-    monkeypatch.setattr(sequence, "judge_frames", counting(sequence.judge_frames, opened, "judged"))
+    judge = counting(frame_file.why_few_pixels, opened, "judged")
+    monkeypatch.setattr(frame_file, "why_few_pixels", judge)
     with contextlib.suppress(Stopped, ExceptionGroup, DiffrenderError):
         door(files, tmp_path)
     assert len(calls) == 1
-    assert opened["judged"] == 1
+    assert opened["judged"] == len(files)
     assert {path.name: opened[path.name] for path in files} == {path.name: 2 for path in files}
 
 

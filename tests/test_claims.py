@@ -13,7 +13,7 @@ import pytest
 from astropy.table import MaskedColumn, Table
 
 from pyklip_diffrender import Status
-from pyklip_diffrender.reduction.pages import advice
+from pyklip_diffrender.reduction.fit_status import advice
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"

@@ -25,8 +25,9 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.reduction import existing_products, pages, summarise, write_report
+from pyklip_diffrender.reduction.extended_light import looks_extended
+from pyklip_diffrender.reduction.fit_status import advice
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
-from pyklip_diffrender.reduction.pipeline import looks_extended
 from pyklip_diffrender.reduction.products import page
 from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import Status
@@ -164,8 +165,8 @@ def test_without_orientation_no_north_is_claimed():
 
 def test_every_status_comes_with_advice():
     for status in Status:
-        assert pages.advice(status, patterned=True).endswith(".")
-        missing = "reference stars" in pages.advice(status, patterned=False)
+        assert advice(status, patterned=True).endswith(".")
+        missing = "reference stars" in advice(status, patterned=False)
         assert missing == (status is Status.MODEL_MISMATCH)
 
 

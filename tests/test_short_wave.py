@@ -15,7 +15,7 @@ from pyklip_diffrender.instrument import detector_place, filter_shift, nircam_co
 from pyklip_diffrender.reduction import reduce
 from pyklip_diffrender.refinement import GaussNewton, refine, settings_for
 from pyklip_diffrender.scene import Observation, Planet, Sequence, model_for
-from pyklip_diffrender.scene.jwst_files import mask_place
+from pyklip_diffrender.scene.aligned_frames import mask_place
 from pyklip_diffrender.wavefront import random_opd
 
 SIZE = 36

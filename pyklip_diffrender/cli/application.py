@@ -569,8 +569,6 @@ def doctor(run: Run) -> int:
     return int(failed)
 
 
-# The program: its commands, its messages and its exit status.
-
 _log = logging.getLogger(__name__)
 
 

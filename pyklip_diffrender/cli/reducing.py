@@ -7,7 +7,7 @@ import sys
 from collections import abc
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, redirect_stdout, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from json import dumps, loads
 from pathlib import Path
 from typing import Any, Literal
@@ -52,20 +52,56 @@ _MAST = "mast"
 """Value of --opd for maps that come from MAST."""
 
 
+@dataclass(frozen=True)
+class _Start:
+    """What the reductions of a command start from, beside their frames."""
+
+    opd: str
+    opd_date: Rule | None
+    star_sed: str | None
+    options: ReduceOptions
+
+    @classmethod
+    def checked(
+        cls, *, device: Any, quick: bool, opd: str, opd_date: Rule | None, star_sed: str | None,
+        **options: Any,
+    ) -> _Start:  # fmt: skip
+        """The start that the options of a command describe; UsageError if they cannot be."""
+        if star_sed is not None and options["star_flux"] is not None:
+            raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
+        accuracy: Accuracy = "quick" if quick else ReduceOptions.accuracy
+        try:
+            checked = ReduceOptions(device=device, accuracy=accuracy, **options)
+        except DiffrenderError as error:
+            raise click.UsageError(str(error)) from error
+        return cls(opd, opd_date, star_sed, checked)
+
+    def prepared(self, sequence: Sequence) -> Preparation:
+        """Show the frames of a sequence and its wavefront map, and check that it can be reduced."""
+        _show(sequence)
+        map_ = map_for(sequence, self.opd, self.opd_date)
+        click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
+        return prepare(sequence, map_, self._options_for(sequence.filter))
+
+    def _options_for(self, name: str | None) -> ReduceOptions:
+        """Options with the star's flux density in a filter, if there is a spectrum of the star."""
+        if self.star_sed is None:
+            return self.options
+        flux = star_flux_density(self.star_sed, name or "unknown")
+        click.echo(f"star: {flux.value:.4g} Jy in {name}, by {Path(self.star_sed).name}")
+        return replace(self.options, star_flux=flux)
+
+
 def run_reduction(
     run: Run,
     read: Callable[[], tuple[Sequence, ...]],
     *,
     output: Path,
     overwrite: bool,
-    derivatives: bool,
-    figures: Literal["pdf", "png", "svg"] | None,
     json: bool,
     dry_run: bool,
-    quick: bool,
-    opd: str,
-    opd_date: Rule | None,
-    star_sed: str | None,
+    derivatives: bool,
+    figures: Literal["pdf", "png", "svg"] | None,
     spectra: tuple[str, ...] = (),
     proper_motion: tuple[str, str] | None = None,
     parallax: str | None = None,
@@ -77,14 +113,11 @@ def run_reduction(
     """
     if dry_run and json:
         raise click.UsageError("A --dry-run has no summary to print with --json.")
-    if star_sed is not None and options["star_flux"] is not None:
-        raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
     try:
-        accuracy: Accuracy = "quick" if quick else ReduceOptions.accuracy
         checked_motion(proper_motion, parallax)
-        checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
         raise click.UsageError(str(error)) from error
+    start = _Start.checked(device=run.device, **options)
     # What is there now may be replaced if the user says so, but not what other runs write later.
     writing: dict[str, Any] = {
         "derivatives": derivatives, "figures": figures, "overwrite": overwrite,
@@ -92,7 +125,7 @@ def run_reduction(
     whole = ProductFolder(output, **writing)
     run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
     above = named_files(output, (*COMPARISON, *COMBINED), overwrite)
-    earlier = [whole, *(ProductFolder(each, overwrite=True) for each in _listed(output))]
+    earlier = [ProductFolder(each, overwrite=True) for each in _listed(output)]
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
         sequences = read()
@@ -101,54 +134,41 @@ def run_reduction(
         several = len(sequences) > 1
         folders = [output / name for name in _names(sequences)] if several else [output]
         written = [ProductFolder(each, **writing) for each in folders] if several else [whole]
-        _require_flux_and_spectra(sequences, checked, spectra)
+        _require_flux_and_spectra(sequences, start.options, spectra)
         prepared = []
         for sequence, folder in zip(sequences, folders, strict=True):
             if several:
                 run.claim_folder(folder, tuple(PRODUCTS))
                 click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
-            prepared.append(_prepared(sequence, checked, opd, opd_date, star_sed))
+            prepared.append(start.prepared(sequence))
             if dry_run:
                 click.echo(describe_steps(prepared[-1].sequence, prepared[-1].options))
         if dry_run:
             return
-        summaries = {}
-        for preparation, products in zip(prepared, written, strict=True):
-            summary = _reduced(preparation, products, progress=run.progress)
-            summaries[products.folder] = summary
+        summaries = {
+            products.folder: _reduced(preparation, products, progress=run.progress)
+            for preparation, products in zip(prepared, written, strict=True)
+        }
         place = above.place() if several else output
         above.clear()
-        for each in earlier:
-            if each.asked not in folders:
-                each.clear()
-                if each is not whole and each.asked.is_dir() and not any(each.asked.iterdir()):
-                    each.asked.rmdir()
+        _clear([whole, *earlier], folders)
+        (summary, *_) = summaries.values()
         if several:
-            summary = _compared(
-                summaries,
-                place,
-                spectra=spectra or SPECTRA,
-                star=star_sed,
-                motion=proper_motion,
-                parallax=parallax,
-            )
+            search = {"spectra": spectra or SPECTRA, "star": start.star_sed}
+            motion = {"motion": proper_motion, "parallax": parallax}
+            summary = _compared(summaries, place, **search, **motion)
     if json:
         click.echo(dumps(summary, indent=2))
     require_in_place(*written, above)
 
 
-def _prepared(
-    sequence: Sequence,
-    options: ReduceOptions,
-    opd: str,
-    opd_date: Rule | None,
-    star_sed: str | None,
-) -> Preparation:
-    """Show the frames of a sequence and its wavefront map, and check that it can be reduced."""
-    _show(sequence)
-    map_ = map_for(sequence, opd, opd_date)
-    click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
-    return prepare(sequence, map_, _with_flux(options, star_sed, sequence.filter))
+def _clear(earlier: abc.Iterable[ProductFolder], used: abc.Collection[Path]) -> None:
+    """Delete products of an earlier run from folders that this run has not used."""
+    for each in earlier:
+        if each.asked not in used:
+            each.clear()
+            if each.asked.is_dir() and not any(each.asked.iterdir()):
+                each.asked.rmdir()
 
 
 def _reduced(preparation: Preparation, products: ProductFolder, *, progress: bool) -> Any:
@@ -231,15 +251,6 @@ def _require_flux_and_spectra(
     listed = [each for each in spectra if each != "free"]
     if listed and len(filters) > 1 and "unknown" not in filters:
         planet_spectra(listed, filters)
-
-
-def _with_flux(options: ReduceOptions, star_sed: str | None, name: str | None) -> ReduceOptions:
-    """Options with the star's flux density in a filter, from its spectrum if there is one."""
-    if star_sed is None:
-        return options
-    flux = star_flux_density(star_sed, name or "unknown")
-    click.echo(f"star: {flux.value:.4g} Jy in {name}, by {Path(star_sed).name}")
-    return replace(options, star_flux=flux)
 
 
 def _names(sequences: abc.Sequence[Sequence]) -> list[str]:

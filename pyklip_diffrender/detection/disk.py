@@ -312,8 +312,6 @@ class Disk:
         return path
 
 
-# Extended light about a star, such as a disk: non-negative sources fitted with the star.
-
 Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Rows and columns."""
 

@@ -145,8 +145,6 @@ def _chi2(fits: Sequence[Refinement]) -> float:
     return float(np.mean([fit.chi2_per_pixel for fit in of_target]))
 
 
-# Search for point sources in refined frames.
-
 Fits = Refinement | Sequence[Refinement]
 
 
@@ -244,14 +242,28 @@ def detect(
     if without_limits is not None:
         _require_shape(np.shape(without_limits), fits[0].frames[0].grid.shape[:2])
 
+    outcome = _searched(fits, threshold, inner, scatter, relinearise, progress)
+    return _detection(outcome, threshold, separations, without_limits)
+
+
+def _searched(
+    fits: Sequence[Refinement],
+    threshold: float,
+    inner: float,
+    scatter: float | None,
+    relinearise: float,
+    progress: bool,
+) -> _Outcome:
+    """The last search, with the star refined beside bright candidates; see `detect`."""
+
     def look(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
         maps = Maps(groups_of(fits), progress)
         search = _PeakSearch(maps, fits, threshold, inner, scatter)
         return _Outcome(fits, maps, *search.run(known))
 
-    def look_and_refine(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
+    def look_and_refine(fits: Sequence[Refinement]) -> _Outcome:
         """Search, and search again with the candidates as companions if some are bright."""
-        last = look(fits, known)
+        last = look(fits, Candidates.of_fit(fits[0]))
         if len(last.candidates) >= _MAX_CANDIDATES:
             return last
         is_calibrated = all(fit.status.calibrated for fit in last.fits)
@@ -261,25 +273,33 @@ def detect(
             return last
         return look(with_companions(last.fits, last.candidates, progress), last.candidates)
 
-    last = look_and_refine(fits, Candidates.of_fit(fits[0]))
-    better = None
+    last = look_and_refine(fits)
     if len(last.candidates) < _MAX_CANDIDATES:
         better = with_raised_peaks(last.fits, last.maps, last.candidates, inner, progress)
-    if better is not None:
-        last = look_and_refine(better, Candidates.of_fit(better[0]))
+        last = last if better is None else look_and_refine(better)
     if len(last.candidates) >= _MAX_CANDIDATES:
         _log.warning(
             "%d candidates, the most that are looked for: parts of something extended? The star is "
             "not refined with them in the model",
             len(last.candidates),
         )
-    fits, maps, candidates = last.fits, last.maps, last.candidates
-    factor, significance = last.factor, last.significance
-    if not candidates.converged:
+    if not last.candidates.converged:
         _log.warning(
             "the positions of %d candidates did not settle; two of them may be one source, or the "
-            "star's own error", len(candidates)
+            "star's own error", len(last.candidates)
         )  # fmt: skip
+    return last
+
+
+def _detection(
+    outcome: _Outcome,
+    threshold: float,
+    separations: ArrayLike | None,
+    without_limits: NDArray[np.bool_] | None,
+) -> Detection:
+    """The maps, candidates and contrast curve of a search; see `detect`."""
+    fits, maps, candidates = outcome.fits, outcome.maps, outcome.candidates
+    factor = outcome.factor
     information = np.where(maps.information > 0, maps.information, np.nan)
     photon = np.where(maps.photon > 0, maps.photon, np.nan) ** -0.5
     factors = factor.of(maps.grid)
@@ -292,14 +312,6 @@ def detect(
         np.array(ring)[:, has_limits[ring]]
         for ring in ring_pixels(maps.grid, separations, most=error.size)
     ]
-    # The noise of fits that do not explain their data is not known.
-    false_alarm = np.full(len(candidates), np.nan)
-    if all(fit.status.calibrated for fit in fits):
-        snr = candidates.snr(factor)
-        false_alarm = significance.false_alarms(factor, snr, candidates.offsets)
-        if count_rolls(fits) == 1 and any(f.frames[0].observation.is_nircam for f in fits):
-            # Either noise or a structure of the detector, which only a second roll can tell.
-            false_alarm = 1 - (1 - false_alarm) * (1 - structures_in_single_roll(snr))
     return Detection(
         fits=tuple(fits),
         groups=maps.groups,
@@ -310,7 +322,7 @@ def detect(
         residual_snr=maps.snr(maps.without(candidates)) / factors,
         error_factor=factor,
         sources=with_position_of_star(maps.groups, candidates),
-        false_alarm=false_alarm,
+        false_alarm=_false_alarms(outcome),
         rings=chi2_by_ring(maps.groups, candidates.offsets, factor),
         threshold=threshold,
         contrast_curve=contrast_table(
@@ -324,6 +336,20 @@ def detect(
         has_limits=has_limits,
         grid=maps.grid,
     )
+
+
+def _false_alarms(outcome: _Outcome) -> NDArray[np.float64]:
+    """Probabilities of noise making the candidates, (k,); NaN where the noise is not known."""
+    fits, candidates, factor = outcome.fits, outcome.candidates, outcome.factor
+    # The noise of fits that do not explain their data is not known.
+    if not all(fit.status.calibrated for fit in fits):
+        return np.full(len(candidates), np.nan)
+    snr = candidates.snr(factor)
+    false_alarm = outcome.significance.false_alarms(factor, snr, candidates.offsets)
+    if count_rolls(fits) == 1 and any(f.frames[0].observation.is_nircam for f in fits):
+        # Either noise or a structure of the detector, which only a second roll can tell.
+        return 1 - (1 - false_alarm) * (1 - structures_in_single_roll(snr))
+    return false_alarm
 
 
 def _require_shape(actual: tuple[int, ...], expected: tuple[int, ...]) -> None:

@@ -99,9 +99,6 @@ def draw_curve(
     )  # fmt: skip
 
 
-# The result of a detection: maps, candidates and contrast curve.
-
-
 @dataclass(frozen=True)
 class Detection:
     """Point sources in refined frames: maps, candidates, and the contrast curve.

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,9 +44,6 @@ from pyklip_diffrender.refinement import star_flux_error
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 from pyklip_diffrender.scene.simulation import within_field
-
-if TYPE_CHECKING:
-    pass
 
 # The result of a search of whole frames.
 

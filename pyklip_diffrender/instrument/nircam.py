@@ -118,8 +118,6 @@ def parity_in_y(count: int) -> Tensor:
     )
 
 
-# NIRCam's coronagraph from embedded tables, without downloads.
-
 NIRCAM_LW_PIXELSCALE = 0.062424185
 """arcsec per pixel at MASK335R, the square scale that stpsf 2.2.0 uses before distortion."""
 

@@ -30,8 +30,8 @@ from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.admission import epochs_of
+from pyklip_diffrender.scene.aligned_frames import shift_frames, shift_variances
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
-from pyklip_diffrender.scene.jwst_files import shift_frames, shift_variances
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics, shows_star
 from pyklip_diffrender.wavefront.opd_map import OPDMap
@@ -139,8 +139,6 @@ def _correlation(
             correlation[row, column] = product / (length * np.sqrt((weight * moved**2).sum()))
     return correlation
 
-
-# The choice of the flat-field pattern: of the library, of reference stars, or none.
 
 PatternRequest: TypeAlias = Systematics | PatternLibrary | Literal["auto", "references", "off"]
 

@@ -37,18 +37,11 @@ from pyklip_diffrender.refinement.fit_file import encoded
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
-from pyklip_diffrender.scene.admission import (
-    FrameFile,
-    admissible,
-    exclude_unusable,
-    exposures_in,
-    frames_by_star,
-    require_some,
-)
+from pyklip_diffrender.scene.admission import admitted, exposures_in, frames_by_star
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
+from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
-from pyklip_diffrender.scene.sequence import judge_frames
 from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import wavefront_for
@@ -290,14 +283,12 @@ def _epochs(
     files: Files, opd: Any, stars: Sequence[str], filters: Sequence[str], size: int
 ) -> Iterable[_Epoch]:
     """Sort files, and read the frames of every star, epoch and set-up."""
-    listed = exposures_in(files)
-    exclude_unusable(listed, judge_frames)
-    require_some(listed)
-    for each in listed:
-        if each.reason:
-            _log.warning("%s is left out: %s", each.name, each.reason)
-    by_star = frames_by_star(admissible(listed))
-    known = {each.exposure.filter for each in admissible(listed)}
+    admission = admitted(exposures_in(files))
+    for each, reason in admission.reasons.items():
+        _log.warning("%s is left out: %s", each.name, reason)
+    named = [each for each in admission.left() if each.exposure.star.is_known]
+    by_star = frames_by_star(named)
+    known = {each.exposure.filter for each in admission.left()}
     for choice in filters:
         if not any(same_name(choice, each) for each in known):
             raise unknown_name("filter", choice, known)

@@ -269,8 +269,6 @@ def lacks_pattern(fit: Refinement) -> bool:
     return lacks
 
 
-# Learn the flat-field pattern from stars other than the target.
-
 _ASPECTS = {
     "filter": "filter", "image_mask": "mask", "detector": "detector", "flat": "flat field (R_FLAT)",
 }  # fmt: skip

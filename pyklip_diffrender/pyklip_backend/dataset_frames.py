@@ -42,8 +42,8 @@ from pyklip_diffrender.pyklip_backend.source_frames import (
     recorded_frames,
     why_without_source,
 )
-from pyklip_diffrender.scene.admission import FrameFile
 from pyklip_diffrender.scene.exposure import beginning, is_reference, star_of
+from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.integrations import checked_stacks, compressed, mask_unusable
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
@@ -125,9 +125,8 @@ def _sequence(
     first = next((k for k, h in enumerate(headers) if not is_reference(h)), 0)
     name = source.filenames[frames[first]]
     return Sequence.of_opened(
-        # Copies, into which the reasons are written.
-        [replace(source.files[path]) for path in dict.fromkeys(paths)],
-        [FrameFile.opened(path, frames=True) for path in library],
+        [source.files[path] for path in dict.fromkeys(paths)],
+        [FrameFile.opened(path, lambda exposure: True) for path in library],
         target=next(iter(star_of(headers[first], name).names), None),
         filter=header_text(headers[first], "FILTER", name),
     )

@@ -16,7 +16,7 @@ from torch import Tensor
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.source_frames import Pointing
-from pyklip_diffrender.scene.jwst_files import shift_frames
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.simulation import field_of
 from pyklip_diffrender.wavefront.opd_map import OPDMap

@@ -304,8 +304,6 @@ def _require_copy(record: ReductionRecord, frames: Frames) -> None:
         )
 
 
-# One call of `klip_dataset` in which the star is rendered instead of estimated from references.
-
 _log = logging.getLogger(__name__)
 
 RESULTS = "diffrender_results"

@@ -209,9 +209,6 @@ def _fm_klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
     return dispatch_fm(*args, **kwargs)
 
 
-# Make ``algo="diffrender"`` work in pyKLIP, permanently or in a block, and undo it exactly.
-
-
 def _use(registered: bool, blocks: int) -> None:
     """Set the users; patch pyKLIP for the first and restore it after the last.
 

@@ -27,10 +27,11 @@ from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, NoValidP
 from pyklip_diffrender.io.files import open_fits, read_image
 from pyklip_diffrender.io.headers import fits_text, header_number, merged_header
 from pyklip_diffrender.io.units import native_float64
-from pyklip_diffrender.scene.admission import FrameFile
+from pyklip_diffrender.scene.aligned_frames import SHIFTS
 from pyklip_diffrender.scene.exposure import beginning, middle
+from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.integrations import pointings
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, SHIFTS, single_precision, unflagged
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, single_precision, unflagged
 from pyklip_diffrender.scene.observation import Observation, frames_in
 from pyklip_diffrender.scene.sequence import Sequence
 
@@ -237,12 +238,15 @@ class OpenedFile(NamedTuple):
         """Open a file, once, and read it plane by plane; KeyError without a SCI extension."""
         where = Path(path).absolute()
         with open_fits(where, images=False) as hdus:
-            file = FrameFile.in_hdus(hdus, where, frames=False)
+            file = FrameFile.in_hdus(hdus, where)
             science = hdus["SCI"]
             if not science.is_image:
                 raise CorruptFileError(f"{where.name}: SCI is a table, not an image")
             aligned = any(name in hdus for name in SHIFTS)
-            frames = None if file.is_product else _every_integration(hdus, file)
+            frames = None
+            if not file.is_product:
+                frames, means = _every_integration(hdus, where)
+                file = replace(file, frames=means)
             single = science.header["BITPIX"] == -32
             as_read = read_image(science, where, single_precision if single else native_float64)
             as_read = as_read[np.newaxis] if as_read.ndim == 2 else as_read
@@ -257,15 +261,15 @@ class OpenedFile(NamedTuple):
             return cls(file, hdus[0].header, science.header, as_read, usable, frames, aligned)
 
 
-def _every_integration(hdus: fits.HDUList, file: FrameFile) -> Observation | DiffrenderError:
-    """All integrations of an open file, and their means into the file; or why there are none."""
+def _every_integration(
+    hdus: fits.HDUList, path: Path
+) -> tuple[Observation | DiffrenderError, Observation | DiffrenderError]:
+    """All integrations of an open file, and their means; or why there are none."""
     try:
-        frames = Observation(**frames_in(hdus, file.path, every_integration=True, compact=True))
-        file.frames = frames.means()
+        frames = Observation(**frames_in(hdus, path, every_integration=True, compact=True))
+        return frames, frames.means()
     except DiffrenderError as error:
-        file.frames = error
-        return error
-    return frames
+        return error, error
 
 
 def _without_flags(

@@ -56,7 +56,7 @@ def subtract_by_refinement(
     model = model_of(observation, settings)
     # Takes a second to import, so only after the input has been checked.
     from pyklip_diffrender.reduction import prepare
-    from pyklip_diffrender.reduction.pipeline import warn_of_status
+    from pyklip_diffrender.reduction.fit_status import warn_of_status
 
     # Frames with the same star centre and position angle, such as the integrations of one exposure,
     # are averaged; all rolls and dithers share a wavefront. The fit uses a square about the star,
@@ -145,7 +145,7 @@ def _options(
     settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
 ) -> ReduceOptions:
     """Options of the reduction; the settings that are None are those of `reduce`."""
-    from pyklip_diffrender.reduction.pipeline import MAX_CHI2
+    from pyklip_diffrender.reduction.fit_status import MAX_CHI2
 
     own = {
         "settings": settings.fit,

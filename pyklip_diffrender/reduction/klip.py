@@ -20,7 +20,7 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 from pyklip.klip import klip_math, rotate
 from scipy import stats
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import map_coordinates
 from scipy.signal import fftconvolve
 
 from pyklip_diffrender.detection import Detection
@@ -30,10 +30,40 @@ from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.io.units import to_arcsec
-from pyklip_diffrender.scene.jwst_files import shift_frames
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.star_place import without_gaps
 
-# KLIP by pyKLIP on arrays in memory, for comparisons.
+Image = NDArray[np.float64]
+
+_SIGMAS = 5.0
+
+_MODES = 5
+"""Largest number of KL modes."""
+
+_INNER = 1.4
+"""Radius in lambda/D within which KLIP does not subtract the star."""
+
+_FIRST = 2
+"""Smallest of the default separations, lambda/D."""
+
+_COUNT = 12
+"""Number of the default separations."""
+
+_TRIALS = 4
+"""Position angles at which planets are injected at every separation."""
+
+_GOLDEN = 137.5
+"""Degrees from the planets at one separation to those at the next."""
+
+_TURN = 1.0
+"""Degrees between rolls that are references of each other."""
+
+_HALF = 10
+"""Pixels from the middle of the matched filter to its edge."""
+
+_CLOSE = 1.5
+"""Pixels about the position of an injected planet in which its peak is sought."""
 
 
 def klip_rdi(
@@ -87,40 +117,6 @@ def klip_rdi(
             verbose=False,
         )
         return np.array(dataset.output[0, 0, 0], dtype=np.float64)
-
-
-# The contrast curve of KLIP (ADI and RDI) for frames that were searched with a model.
-
-Image = NDArray[np.float64]
-
-_SIGMAS = 5.0
-
-_MODES = 5
-"""Largest number of KL modes."""
-
-_INNER = 1.4
-"""Radius in lambda/D within which KLIP does not subtract the star."""
-
-_FIRST = 2
-"""Smallest of the default separations, lambda/D."""
-
-_COUNT = 12
-"""Number of the default separations."""
-
-_TRIALS = 4
-"""Position angles at which planets are injected at every separation."""
-
-_GOLDEN = 137.5
-"""Degrees from the planets at one separation to those at the next."""
-
-_TURN = 1.0
-"""Degrees between rolls that are references of each other."""
-
-_HALF = 10
-"""Pixels from the middle of the matched filter to its edge."""
-
-_CLOSE = 1.5
-"""Pixels about the position of an injected planet in which its peak is sought."""
 
 
 def klip_curve(
@@ -198,11 +194,9 @@ def klip_curve(
 
 def _has_limits(detection: Detection, grid: Image) -> NDArray[np.bool_]:
     """Where a detection has limits, on another grid, (ny, nx)."""
-    nearest = np.rint(pixels_of(detection.grid, grid)).astype(int)
-    columns, rows = np.moveaxis(nearest, -1, 0)
-    ny, nx = detection.has_limits.shape
-    inside = (rows >= 0) & (rows < ny) & (columns >= 0) & (columns < nx)
-    return inside & detection.has_limits[rows.clip(0, ny - 1), columns.clip(0, nx - 1)]
+    columns, rows = np.moveaxis(pixels_of(detection.grid, grid), -1, 0)
+    known = detection.has_limits.astype(float)
+    return map_coordinates(known, [rows, columns], order=0, mode="grid-constant") > 0
 
 
 def klip_image(
@@ -373,9 +367,4 @@ class KlipSubtraction:
 def _filled(observation: Observation) -> Image:
     """The mean of the frames, masked pixels interpolated between their neighbours."""
     mean = observation.combined()
-    valid = mean.valid[0].astype(float)
-    # Mean of the valid neighbours with Gaussian weights: sum w v d / sum w v.
-    weight = gaussian_filter(valid, 1.0)
-    nearby = gaussian_filter(mean.data[0], 1.0)
-    filled = np.divide(nearby, weight, out=np.zeros_like(nearby), where=weight > 1e-3)
-    return np.where(mean.valid[0], mean.data[0], filled)
+    return without_gaps(np.where(mean.valid[0], mean.data[0], np.nan))

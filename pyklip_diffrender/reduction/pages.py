@@ -16,7 +16,6 @@ from urllib.parse import quote
 import numpy as np
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.refinement import Status
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -30,42 +29,6 @@ _SENTENCE_AT = 1.5
 
 _TINY = 1e-9
 """Probabilities below this rest on tails that no noise is known to follow."""
-
-_ADVICE = {
-    Status.CONVERGED: "The stated errors and limits can be used as they are.",
-    Status.MODEL_MISMATCH: (
-        "3 of the 7 reductions of real frames in the documentation end with this status: two of a "
-        "star with a disk, and one with a flat-field pattern that is not that of the library. "
-        "Errors of candidates are scaled to the scatter in the S/N map. See whether a faint "
-        "candidate is in every roll and looks like a point source, and check the filter, the masks "
-        "and the date of the wavefront map. For a star with a disk, use the option disk."
-    ),
-    Status.PRIOR_MISMATCH: (
-        "Errors of candidates are scaled to the scatter in the S/N map. Repeat the reduction with "
-        "a wavefront map nearer in time or, in Python, with WavefrontPrior(fit_scales=True), which "
-        "lets the data determine how much the wavefront may change."
-    ),
-    Status.ITERATION_LIMIT: (
-        "The result is the best iterate. If chi-squared was still falling in the history of the "
-        "fit, repeat it with more steps, such as GaussNewton.nircam(max_iterations=80); if it "
-        "hardly changed, try a wavefront map nearer in time."
-    ),
-    Status.DIVERGED: (
-        "Do not use this result. Check the unit and orientation of the wavefront map, the position "
-        "of the star and the pixel mask."
-    ),
-}
-
-_REFERENCES = (
-    " The flat-field pattern was not known: add reference stars, or the systematics.fits of an "
-    "earlier reduction."
-)
-
-
-def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
-    """Advice about the status of a fit, with or without a known flat-field pattern."""
-    missing = _REFERENCES if status is Status.MODEL_MISMATCH and not patterned else ""
-    return f"{_ADVICE[status]}{missing} {remark}".rstrip()
 
 
 def sentence(summary: Mapping[str, Any]) -> str:
@@ -244,17 +207,11 @@ FIGURE_FORMATS = ("pdf", "png", "svg")
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A figure of a page and its words."""
+    """A figure of a page and its caption."""
 
     name: str  # of its file, without the ending
     figure: Any  # of matplotlib
-    description: str  # a sentence, also for readers who do not see the picture
-    details: str = ""  # further sentences of the caption
-
-    @property
-    def caption(self) -> str:
-        """The description with the details."""
-        return f"{self.description} {self.details}".rstrip()
+    caption: str  # the first sentence also describes the picture to readers who do not see it
 
     @cached_property
     def uri(self) -> str:

@@ -309,39 +309,34 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     up = "north up" if summary["oriented"] else "oriented like the first frame"
     separations = [row["separation_arcsec"] for row in summary["limits"]]
     ours, theirs = overview.kept(separations)
+    fitted = (
+        "A candidate, which was fitted together with the star, keeps all of its light. "
+        "Circles mark the candidates. "
+        if count
+        else ""
+    )
     words = {
         "without_star": (
-            f"Mean of all frames minus the star, {up}.",
-            _kept("A faint source keeps", ours, separations, " (THROUGHPUT in images.fits)")
-            + (
-                "A candidate, which was fitted together with the star, keeps all of its light. "
-                "Circles mark the candidates. "
-                if count
-                else ""
-            )
-            + "The scale is linear near 0 and logarithmic beyond.",
+            f"Mean of all frames minus the star, {up}. "
+            f"{_kept('A faint source keeps', ours, separations, ' (THROUGHPUT in images.fits)')}"
+            f"{fitted}The scale is linear near 0 and logarithmic beyond."
         ),
         "most_probable": (
             f"Most probable image of the sky without star and detector, {up}, from all frames and "
-            "on the same scale.",
-            "Point sources have 0.4 to 1 of their peak, least close to the "
-            "star, and no side lobes.",
+            "on the same scale. Point sources have 0.4 to 1 of their peak, least close to the "
+            "star, and no side lobes."
         ),
-        "snr": (
-            f"S/N of a point source at every pixel, {some}.",
-            "The scale is linear within ±5.",
-        ),
+        "snr": f"S/N of a point source at every pixel, {some}. The scale is linear within ±5.",
     }
     if overview.klip is not None and theirs is not None:
-        label = overview.klip.label
         words["klip"] = (
-            f"Mean of the same frames after {label}, on the same scale.",
-            _kept("Any source, a candidate too, keeps about", theirs, separations),
-        )
+            f"Mean of the same frames after {overview.klip.label}, on the same scale. "
+            f"{_kept('Any source, a candidate too, keeps about', theirs, separations)}"
+        ).rstrip()
     figures, axes = _panels(len(overview.panels))
     for ax, panel in zip(axes, overview.panels, strict=True):
         overview.draw(ax, panel)
-    return _pictures(figures, overview.panels, *(words[each] for each in overview.panels))
+    return _pictures(figures, {each: words[each] for each in overview.panels})
 
 
 def _kept(
@@ -377,15 +372,12 @@ def _curve(
     )
     figure, ax = drawing.wide_panel()
     draw_curve(ax, detection, klip, legend_below=True)
-    return _pictures(
-        [figure],
-        ["contrast_curve"],
-        (
-            f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}, "
-            "against separation: the median of all position angles and their range.",
-            f"Dashed: the limit for an exactly known star.{beside}{dotted} {_scaled(detection)}",
-        ),
+    caption = (
+        f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}, against "
+        "separation: the median of all position angles and their range. "
+        f"Dashed: the limit for an exactly known star.{beside}{dotted} {_scaled(detection)}"
     )
+    return [Picture("contrast_curve", figure, caption)]
 
 
 def _candidate(detection: Detection, place: int) -> list[Picture]:
@@ -399,8 +391,7 @@ def _candidate(detection: Detection, place: int) -> list[Picture]:
             drawing.stamp_panels(stamp, unit),
             f"Candidate {number} in frame {frame}{_roll(stamp.north)}: the data; without star, "
             "background and other candidates; the model of the source, on the same scale; and what "
-            "is left, in standard deviations of the noise.",
-            "The cross marks the fitted position.",
+            "is left, in standard deviations of the noise. The cross marks the fitted position.",
         )
         for frame, stamp in stamps.items()
     ]
@@ -418,9 +409,8 @@ def _candidate(detection: Detection, place: int) -> list[Picture]:
         f"candidate_{number}_corner",
         figure,
         f"Contrast and position of candidate {number} by the covariance of the fit, with the star "
-        "and the other candidates marginalised.",
-        "Ellipses have one and two standard deviations, 39 and 86 % of "
-        "the probability. Errors include those of the star's flux and position.",
+        "and the other candidates marginalised. Ellipses have one and two standard deviations, 39 "
+        "and 86 % of the probability. Errors include those of the star's flux and position.",
     )
     return [*pictures, corner]
 
@@ -525,52 +515,48 @@ def _wide(wide: WideField) -> list[Picture]:
     oriented = wide.observation.position_angles is not None
     up = "north up" if oriented else "oriented like the first frame"
     ny, nx = wide.snr.shape
-    return _pictures(
-        figures,
-        ["whole_frames_snr", "whole_frames_contrast_curve"],
-        (
+    words = {
+        "whole_frames_snr": (
             f"S/N of a point source in the whole frames, {some}, {up}: {nx} × {ny} pixels, at most "
-            "the field of the mask, 20 arcsec wide.",
-            "Circles have the numbers of the table. About the "
-            "star it is that of the search above; elsewhere the star, extrapolated from its fit, "
-            "and the background were subtracted. Errors follow the scatter of the S/N at every "
-            "separation.",
+            "the field of the mask, 20 arcsec wide. Circles have the numbers of the table. About "
+            "the star it is that of the search above; elsewhere the star, extrapolated from its "
+            "fit, and the background were subtracted. Errors follow the scatter of the S/N at "
+            "every separation."
         ),
-        ("Contrast limit to the edge of the frames, as far as half of a ring is in them.",),
-    )
+        "whole_frames_contrast_curve": (
+            "Contrast limit to the edge of the frames, as far as half of a ring is in them."
+        ),
+    }
+    return _pictures(figures, words)
 
 
 def _disk(disk: Disk) -> list[Picture]:
     """The frames without the star, and the extended light that was fitted."""
     figures, axes = _panels(2)
     disk.plot(axes)
-    return _pictures(
-        figures,
-        ["extended_light", "extended_light_model"],
-        (
-            "Frames minus the star, turned to the orientation of the first one and averaged.",
-            "The star was fitted together with the extended light, which therefore is not "
-            "subtracted with it.",
+    words = {
+        "extended_light": (
+            "Frames minus the star, turned to the orientation of the first one and averaged. The "
+            "star was fitted together with the extended light, which therefore is not subtracted "
+            "with it."
         ),
-        (
+        "extended_light_model": (
             "Light of the non-negative sources that were fitted together with the star, as the "
-            "coronagraph shows it in the first frame.",
+            "coronagraph shows it in the first frame."
         ),
-    )
+    }
+    return _pictures(figures, words)
 
 
 def _injections(planets: QTable) -> list[Picture]:
     """Recovered over injected contrast."""
     figure, ax = drawing.panel()
     drawing.injected_planets(ax, planets)
-    return _pictures(
-        [figure],
-        ["injected_planets"],
-        (
-            f"Recovered over injected contrast of {len(planets)} planets against separation.",
-            "Filled: detected. Open: not detected, and measured at the known place.",
-        ),
+    caption = (
+        f"Recovered over injected contrast of {len(planets)} planets against separation. Filled: "
+        "detected. Open: not detected, and measured at the known place."
     )
+    return [Picture("injected_planets", figure, caption)]
 
 
 def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
@@ -578,14 +564,11 @@ def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
     about = fractions.meta
     figure, ax = drawing.panel()
     drawing.completeness(ax, fractions, curve, about["contrast_50"], about["contrast_95"])
-    return _pictures(
-        [figure],
-        ["completeness"],
-        (
-            "Fraction of planets that the search finds, by contrast and separation.",
-            "Dashed: 50 %; solid: 95 %; dotted: the contrast curve at 5 sigma.",
-        ),
+    caption = (
+        "Fraction of planets that the search finds, by contrast and separation. Dashed: 50 %; "
+        "solid: 95 %; dotted: the contrast curve at 5 sigma."
     )
+    return [Picture("completeness", figure, caption)]
 
 
 def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
@@ -600,19 +583,19 @@ def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
     )
     mean = f", the mean of {count} integrations" if count > 1 else ""
     mean += "" if reduction.disk is None else ", without the extended light"
-    return _pictures(
-        _of_frame(detection, frame),
-        [f"frame_{frame + 1}_{each}" for each in ("data", "model", "residual")],
-        (
-            f"Image of {observation.target} behind the coronagraph{mean}, in {unit}.",
-            "The scale is linear near 0 and logarithmic in bright parts; the cross marks the star.",
+    words = {
+        "data": (
+            f"Image of {observation.target} behind the coronagraph{mean}, in {unit}. The scale is "
+            "linear near 0 and logarithmic in bright parts; the cross marks the star."
         ),
-        ("The fitted star and background, on the same scale.",),
-        (
-            "Data without the star, over the noise of each pixel.",
-            f"The scale is linear within ±5.{subtracted}",
+        "model": "The fitted star and background, on the same scale.",
+        "residual": (
+            "Data without the star, over the noise of each pixel. The scale is linear within ±5."
+            f"{subtracted}"
         ),
-    )
+    }
+    named = {f"frame_{frame + 1}_{name}": text for name, text in words.items()}
+    return _pictures(_of_frame(detection, frame), named)
 
 
 def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[Picture]:
@@ -626,17 +609,18 @@ def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[P
     drawing.wavefront_map(axes[0], before, width, title="Before the fit", limit=limit)
     drawing.wavefront_map(axes[1], after, width, title="After the fit", limit=limit)
     drawing.wavefront_map(axes[2], after - before, width, title="Change")
-    return _pictures(
-        figures,
-        [f"wavefront_{each}" for each in ("before", "after", "change")],
-        (f"The wavefront map that the fit started from ({about['name']}), {rms[0]} rms.",),
-        (f"The wavefront of the first frame after the fit, {rms[1]} rms.",),
-        (
-            f"Change of the wavefront, after minus before: {rms[2]} rms.",
-            "The frames measure only what the Lyot stop lets "
-            "through and what reaches the fitted pixels; the rest follows from the prior.",
+    words = {
+        "wavefront_before": (
+            f"The wavefront map that the fit started from ({about['name']}), {rms[0]} rms."
         ),
-    )
+        "wavefront_after": f"The wavefront of the first frame after the fit, {rms[1]} rms.",
+        "wavefront_change": (
+            f"Change of the wavefront, after minus before: {rms[2]} rms. The frames measure only "
+            "what the Lyot stop lets through and what reaches the fitted pixels; the rest follows "
+            "from the prior."
+        ),
+    }
+    return _pictures(figures, words)
 
 
 def _of_frame(detection: Detection, frame: int) -> list[Any]:
@@ -672,8 +656,7 @@ def _panels(count: int) -> tuple[list[Any], list[Any]]:
     return [figure for figure, _ in panels], [ax for _, ax in panels]
 
 
-def _pictures(figures: Sequence[Any], names: Sequence[str], *words: Sequence[str]) -> list[Picture]:
-    return [
-        Picture(name, figure, *text)
-        for name, figure, text in zip(names, figures, words, strict=True)
-    ]
+def _pictures(figures: Sequence[Any], words: Mapping[str, str]) -> list[Picture]:
+    """Figures with the names of their files and their captions."""
+    pairs = zip(figures, words.items(), strict=True)
+    return [Picture(name, figure, caption) for figure, (name, caption) in pairs]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 import warnings
 from collections.abc import Callable, Iterable
@@ -12,11 +11,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 from astropy.table import QTable
 from astropy.time import Time
-from numpy.typing import NDArray
-from scipy import stats
 
 from pyklip_diffrender.detection import (
     Detection,
@@ -36,7 +32,6 @@ from pyklip_diffrender.detection import (
 from pyklip_diffrender.errors import (
     DiffrenderError,
     DiffrenderWarning,
-    RefinementError,
 )
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import numbered_stages, stage
@@ -49,7 +44,8 @@ from pyklip_diffrender.pattern import (
     fit_with_pattern,
     is_known_beside,
 )
-from pyklip_diffrender.reduction.pages import advice
+from pyklip_diffrender.reduction.extended_light import looks_extended, on_extended_light
+from pyklip_diffrender.reduction.fit_status import require_plausible
 from pyklip_diffrender.reduction.visit import (
     Contribution,
     Joined,
@@ -60,7 +56,6 @@ from pyklip_diffrender.reduction.visit import (
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
-    Status,
     coarse_arguments,
     quick_settings,
     refine,
@@ -78,108 +73,6 @@ from pyklip_diffrender.scene.simulation import model_for, within_field
 from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
 from pyklip_diffrender.wavefront.opd import wavefront_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
-
-# Whether a fit may be subtracted, and what to say about one that has not converged.
-
-MAX_CHI2 = 100.0
-"""Default of the largest reduced chi-squared of a plausible fit. Fits of real frames have 0.5 to 6,
-12 with a bright disk; with a star in the wrong place it is in the thousands."""
-
-
-def require_plausible(name: str, result: Refinement, limit: float) -> None:
-    """Raise RefinementError for a fit that failed, or has nothing to do with the frames."""
-    from pyklip_diffrender.refinement.fit_result import WHAT_TO_CHECK
-
-    if not result.status.usable:
-        raise RefinementError(f"{name}: the fit ended as {result.status}", result)
-    chi2 = reduced_chi2(result)
-    if chi2 > limit:
-        raise RefinementError(
-            f"{name}: reduced chi-squared is {chi2:.3g}, above max_chi2={limit:g}: the rendered "
-            f"star is not the star in these frames. {WHAT_TO_CHECK} For a companion as bright as "
-            "the star's halo, give fit=GaussNewton.nircam(companions=...). max_chi2=inf subtracts "
-            "whatever was fitted",
-            result,
-        )
-
-
-def reduced_chi2(result: Refinement) -> float:
-    """Chi-squared per degree of freedom, or per pixel where that is not known."""
-    reduced = float(result.reduced_chi2)
-    return reduced if math.isfinite(reduced) else float(result.chi2_per_pixel)
-
-
-def warn_of_status(name: str, result: Refinement) -> None:
-    """Warn of a fit that is usable but has not converged, and say what to do about it."""
-    if result.status is not Status.CONVERGED:
-        todo = advice(result.status, patterned=result.systematics is not None)
-        warnings.warn(
-            f"{name}: the fit ended as {result.status} (chi-squared per pixel "
-            f"{result.chi2_per_pixel:.3g}). What to do: {todo} See 'Reading a status' in the "
-            "documentation",
-            DiffrenderWarning,
-            stacklevel=2,
-        )
-
-
-# Whether candidates are parts of extended light, such as a disk, rather than planets.
-
-_UNLIKELY = 0.01
-"""Probability below which unrelated sources are not taken to be arranged by chance."""
-
-_NEAR = 1.5
-"""Separation of neighbours, lambda/D: one extended source is found as several this close."""
-
-
-def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
-    """Say how candidates are arranged like extended light; empty if they may be so by chance.
-
-    `candidates` has x and y from the star, and frame_angle; `resolution` is lambda/D and `edge` the
-    largest separation that was searched, arcsec.
-    """
-    # Sources that have nothing to do with each other have independent position angles, and are
-    # spread evenly over the field. The number of candidates alone says nothing.
-    count = len(candidates)
-    if count < 2:
-        return ""
-    if count > 2:
-        axes = np.sort(candidates["frame_angle"].value % 180)
-        gaps = np.diff(axes, append=axes[0] + 180)
-        # All axes are in the arc that is left by the largest gap. The probability that n random
-        # axes are in an arc a of their circle, a < 1/2, is n a^(n - 1).
-        arc = 1 - gaps.max() / 180
-        if arc < 0.5 and count * arc ** (count - 1) < _UNLIKELY:
-            return "The candidates are in line with the star, like an edge-on disk"
-    places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
-    distances = np.hypot(*(places[:, None] - places).T)[np.triu_indices(count, 1)]
-    # Each of the n (n - 1) / 2 pairs is within reach of each other with the probability
-    # (reach / edge)^2, the ratio of two areas, so that their number is nearly Poisson's.
-    reach = _NEAR * resolution
-    expected = len(distances) * (reach / edge) ** 2
-    if stats.poisson.sf((distances < reach).sum() - 1, expected) < _UNLIKELY:
-        return "Candidates are next to each other, like parts of an extended source"
-    return ""
-
-
-def on_extended_light(candidates: QTable, offsets: NDArray[np.float64], resolution: float) -> str:
-    """Say which candidates lie on extended light that was fitted; empty if none does.
-
-    `candidates` has x, y and separation. `offsets` (k, 2) are x, y of the sources of the extended
-    light from the star; `resolution` is lambda/D, arcsec.
-    """
-    if not len(candidates) or not len(offsets):
-        return ""
-    places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
-    away = np.hypot(*np.moveaxis(places[:, None] - offsets, -1, 0)).min(axis=1)
-    near = np.sort(candidates["separation"].value[away < resolution])
-    if not len(near):
-        return ""
-    separations = ", ".join(f"{each:.2f}" for each in near)
-    return (
-        f"On the extended light, candidates at {separations} arcsec may be parts of it that its "
-        "fit has left."
-    )
-
 
 # The result of a reduction.
 

@@ -145,8 +145,8 @@ def _tracks(combination: Combination) -> list[Picture]:
                 f"track_{number}",
                 figure,
                 f"Candidate {number} of the combined search, filled, and where a source in the "
-                "background would be at the other dates, open and connected by the dashed line.",
-                "A companion stays, apart from its orbit.",
+                "background would be at the other dates, open and connected by the dashed line. A "
+                "companion stays, apart from its orbit.",
             )
         )
     return pictures

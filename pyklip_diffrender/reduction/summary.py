@@ -20,7 +20,8 @@ from pyklip_diffrender.io.headers import known_number, known_text
 from pyklip_diffrender.io.tables import labelled, plain_rows
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
-from pyklip_diffrender.reduction.pages import advice, sentence
+from pyklip_diffrender.reduction.fit_status import advice
+from pyklip_diffrender.reduction.pages import sentence
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.observation import Observation

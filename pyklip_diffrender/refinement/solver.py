@@ -470,8 +470,6 @@ def conjugate_gradients(
     return x, False
 
 
-# Damped Gauss-Newton steps on the unknowns of a fit.
-
 _TRIES = 7
 """Largest number of attempts at a step, with increasing damping. The last has a damping of 2,300:
 what has a prior hardly moves any more."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.integrations import calibrated_errors
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, shift_frames
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.objects import (
     ALPHA_PICTORIS_W2,
     PAPER_SEGMENT_GAP,

@@ -8,29 +8,26 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-from astropy import units as u
-from astropy.io import fits
 from astropy.time import Time
 
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.io.files import open_fits, product_in, unpacked_name
-from pyklip_diffrender.io.headers import merged_header, same_name, unknown_name
+from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.io.files import unpacked_name
+from pyklip_diffrender.io.headers import same_name, unknown_name
 from pyklip_diffrender.scene.associations import ListedFile, listed_files
 from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
+from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.pixel_checks import copies, why_other_brightness, why_turned
 
-# Files of frames, and which of them cannot be used or are there twice.
+EPOCH = 5.0
+"""Days between frames that may share a wavefront map."""
 
-_SENSED = "RESULT_PHASE"
-"""Extension of wavefront-sensing files of MAST."""
-
-_MAP = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd"
+_TWO_STARS = 1.0
+"""arcsec between stars with other names on one date that are not one star."""
 
 _USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
 """Levels of frames that are still those of the detector, the best first."""
@@ -42,88 +39,67 @@ _NOT_USABLE = {
     "psfstack": "a stack of reference stars (psfstack)",
 }
 
-
 _OTHER_TYPES = {
     "NRC_TACQ": "an image for acquiring the target",
     "NRC_TACONFIRM": "an image that confirms the acquisition of the target",
     "NRC_IMAGE": "an image without a coronagraph",
-    "MIR_TACQ": "an image for acquiring the target",
-    "MIR_TACONFIRM": "an image that confirms the acquisition of the target",
 }
 
 
-@dataclass(eq=False)
-class FrameFile:
-    """A file that may become part of a sequence."""
-
-    path: Path
-    exposure: Exposure
-    star: str = ""  # the same for all files of the star
-    reason: str = field(default="", repr=False)  # why it is excluded, or empty
-    for_reference: bool = False  # asked for as a reference star's, whatever its header says
-    is_product: bool = False  # made from frames, and has none
-    place: tuple[float, float] | None = None  # x, y of the star, from 0, if not the header's
-    # The mean of the integrations of each pointing, or why they cannot be read; None until needed.
-    frames: Observation | DiffrenderError | None = field(default=None, repr=False)
-    # The mean of the integrations of each pointing that are used, once they were read.
-    observation: Observation | None = field(default=None, repr=False)
-
-    @classmethod
-    def in_hdus(
-        cls, hdus: fits.HDUList, path: Path, *, frames: bool | Callable[[Exposure], bool]
-    ) -> FrameFile:
-        """Read the header of an open file, and the means of its frames if they are asked for."""
-        product = _why_a_product(hdus)
-        if product:
-            return cls(path, Exposure(path.name), reason=product, is_product=True)
-        try:
-            science = hdus["SCI"]
-            header = merged_header(hdus[0].header, science.header, path.name)
-            shape = tuple(science.shape) if science.is_image else ()
-            file = cls(path, Exposure.of(header, path.name, shape))
-        except DiffrenderError as error:
-            file = cls(path, Exposure(path.name), reason=_without_name(error, path.name))
-        if frames if isinstance(frames, bool) else not file.reason and frames(file.exposure):
-            try:
-                file.frames = Observation.means_from_hdus(hdus, path)
-            except DiffrenderError as error:
-                file.frames = error
-        return file
-
-    @classmethod
-    def opened(cls, path: Path, *, frames: bool | Callable[[Exposure], bool]) -> FrameFile:
-        """Open a file once; read its header, and the means of its frames if they are asked for."""
-        try:
-            with open_fits(path, images=False) as hdus:
-                return cls.in_hdus(hdus, path, frames=frames)
-        except DiffrenderError as error:
-            return cls(path, Exposure(path.name), reason=_without_name(error, path.name))
-
-    @property
-    def name(self) -> str:
-        """Name of the file."""
-        return self.path.name
-
-    def read(self) -> Observation | None:
-        """The means of the file, read once; None, with the reason, if it has none."""
-        if self.observation is None and not self.reason:
-            try:
-                self.observation = self._means()
-            except DiffrenderError as error:
-                self.reason = _without_name(error, self.name)
-        return self.observation
-
-    def _means(self) -> Observation:
-        """The mean of the integrations of each pointing that are used."""
-        if isinstance(self.frames, DiffrenderError):
-            raise self.frames
-        if self.frames is None:
-            return Observation.means_from_fits(self.path, star=self.place)
-        return self.frames
+Reasons = dict[FrameFile, str]
+"""Why files are left out: what a rule makes of the files that it gets."""
 
 
-def _without_name(error: Exception, name: str) -> str:
-    return str(error).removeprefix(f"{name}: ")
+class Admission:
+    """Files that may become part of a sequence, and why some of them are left out."""
+
+    def __init__(self, files: Iterable[FrameFile]) -> None:
+        self.files = list(files)
+        self.reasons: Reasons = {each: each.fault for each in self.files if each.fault}
+
+    def copy(self) -> Admission:
+        """The same files, of which others can be left out."""
+        copied = Admission(self.files)
+        copied.reasons |= self.reasons
+        return copied
+
+    def left(self, files: Iterable[FrameFile] | None = None) -> list[FrameFile]:
+        """The files that are not left out, of some, or of all by default."""
+        return [e for e in (self.files if files is None else files) if e not in self.reasons]
+
+    def apply(self, rule: Callable[..., Reasons], *groups: Iterable[FrameFile]) -> None:
+        """Leave files out by a rule, which gets what is left of each group, by default all."""
+        self.reasons |= rule(*map(self.left, groups or (self.files,)))
+
+    def require_some(self) -> None:
+        """Raise `NoValidPixelsError`, with the reasons, if every file is left out."""
+        if not self.left():
+            count = len(self.files)
+            few = "the file cannot" if count == 1 else f"none of {count} files can"
+            raise NoValidPixelsError(f"{few} be used: {self.in_words(self.files)}")
+
+    def in_words(self, files: Iterable[FrameFile]) -> str:
+        """Why files are left out, each reason once with the first files that it is for."""
+        names: dict[str, list[str]] = {}
+        for each in files:
+            names.setdefault(self.reasons[each], []).append(each.name)
+        parts = []
+        for reason, those in names.items():
+            more = f" and {len(those) - 3} more" if len(those) > 3 else ""
+            parts.append(f"{', '.join(those[:3])}{more}: {reason}")
+        return "; ".join(parts)
+
+
+def admitted(files: Iterable[FrameFile]) -> Admission:
+    """Leave out what cannot be a frame of a star behind a mask, and duplicates.
+
+    Raises `NoValidPixelsError` if no file is left.
+    """
+    admission = Admission(files)
+    for rule in (_without_star, _same_files, _same_exposures):
+        admission.apply(rule)
+    admission.require_some()
+    return admission
 
 
 def exposures_in(
@@ -138,20 +114,16 @@ def exposures_in(
     these is opened twice; files of other levels may be copies, which are not read.
     """
 
-    def is_wanted(exposure: Exposure) -> bool:
+    def are_wanted(exposure: Exposure) -> bool:
         usable = same_name(exposure.filter, filter) and not _why_unusable(exposure)
-        return usable and _rank(exposure) == 0
-
-    frames = False if filter is None else is_wanted
+        return filter is not None and usable and _rank(exposure) == 0
 
     def opened(listed: ListedFile) -> FrameFile:
         path = listed.path
         if listed.reason:
-            return FrameFile(path, Exposure(path.name), reason=listed.reason, is_product=True)
-        file = FrameFile.opened(path, frames=frames)
-        if listed.role == "science":
-            file.exposure = replace(file.exposure, reference=False)
-        return file
+            return FrameFile(path, Exposure(path.name), listed.reason, is_product=True)
+        file = FrameFile.opened(path, are_wanted)
+        return file.marked(reference=False) if listed.role == "science" else file
 
     found = listed_files(files)
     others = list(references)
@@ -167,65 +139,25 @@ def exposures_in(
 def with_references(listed: list[FrameFile], marked: list[FrameFile]) -> list[FrameFile]:
     """Add files of reference stars, whatever their headers say, see `exposures_in`."""
     if marked and all(file.exposure.reference for file in listed if not file.is_product):
-        for file in listed:
-            file.exposure = replace(file.exposure, reference=False)
-    for file in marked:
-        file.exposure = replace(file.exposure, reference=True)
-        file.for_reference = True
-    return listed + marked
+        listed = [file.marked(reference=False) for file in listed]
+    return listed + [replace(file.marked(reference=True), for_reference=True) for file in marked]
 
 
-def _why_a_product(hdus: fits.HDUList) -> str:
-    """Why a file holds no frames but something made from them; empty for frames.
-
-    Only the contents count: products keep cards of the frames, and may have any name.
-    """
-    first = hdus[0].header
-    product, what = product_in(hdus), ""
-    if product:
-        what = f"{product}, a product of pyklip_diffrender"
-    elif "SCI" not in hdus and any(_is_map(hdu) for hdu in hdus):
-        return _MAP
-    elif any(key in hdu.header for hdu in hdus[:2] for key in ("PYKLIPV", "PSFSUB")):
-        what = "an image from which pyKLIP has subtracted the star"
-    elif "SCI" not in hdus:
-        names = ", ".join(hdu.name or "unnamed" for hdu in hdus)
-        what = f"a file without an SCI extension ({names})"
-        if any(key in first for key in ("OPD", "PUPILOPD", "PUPLSCAL", "WFSGUID", "TSTAMP")):
-            what = f"an image of a model ({names}), without an SCI extension"
-    return f"it is {what}; expected frames of stage 2 (calints)" if what else ""
+# Rules for files one by one, and for files of one exposure.
 
 
-def _is_map(hdu: Any) -> bool:
-    """Whether an HDU has a map of path differences, as wavefront sensing writes them."""
-    if hdu.name == _SENSED:
-        return True
-    unit = u.Unit(str(hdu.header.get("BUNIT", "")), parse_strict="silent")
-    return bool(hdu.is_image and unit.is_equivalent(u.m))
+def _without_star(files: Iterable[FrameFile]) -> Reasons:
+    """Files that cannot be frames of a star behind a mask, by their headers."""
+    return _with_reasons((each, _why_unusable(each.exposure)) for each in files)
 
 
-Judge = Callable[[Iterable[FrameFile]], None]
-"""Reads files, and excludes those with wrong pixels, such as `sequence.judge_frames`."""
+def with_odd_pixels(files: Iterable[FrameFile]) -> Reasons:
+    """Files that cannot be frames of a star behind a mask, by their pixels, which this reads."""
+    return _with_reasons((each, each.fault_of_pixels) for each in files)
 
 
-def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:
-    """Files that are not excluded."""
-    return [each for each in files if not each.reason]
-
-
-def exclude_unusable(files: Sequence[FrameFile], judge: Judge) -> None:
-    """Exclude files that cannot be frames of a star behind a mask, and duplicates.
-
-    Of several files of one exposure, `judge` decides which is the best that can be used.
-    """
-    for each in admissible(files):
-        each.reason = _why_unusable(each.exposure)
-    _exclude_duplicates(admissible(files), lambda each: str(each.path.resolve()), _same_file)
-    # The same file, packed and unpacked.
-    _exclude_duplicates(
-        admissible(files), lambda each: unpacked_name(str(each.path.resolve())), _same_file
-    )
-    _exclude_duplicates(admissible(files), _moment, _same_exposure, judge)
+def _with_reasons(pairs: Iterable[tuple[FrameFile, str]]) -> Reasons:
+    return {file: reason for file, reason in pairs if reason}
 
 
 def _why_unusable(exposure: Exposure) -> str:
@@ -274,30 +206,42 @@ def _moment(file: FrameFile) -> tuple[object, ...] | None:
     )
 
 
-def _exclude_duplicates(
-    files: Sequence[FrameFile],
-    key: Callable[[FrameFile], object],
-    reason: Callable[[FrameFile], str],
-    judge: Judge | None = None,
-) -> None:
-    """Keep the file of the best level among those with one key, of those that can be used."""
+def _same_files(files: Iterable[FrameFile]) -> Reasons:
+    """Files that are there twice, also packed and unpacked."""
+    reasons: Reasons = {}
+    for group in _groups(files, lambda each: unpacked_name(str(each.path.resolve()))):
+        best, *others = sorted(group, key=lambda each: _rank(each.exposure))
+        reasons |= dict.fromkeys(others, f"the same file as {best.name}")
+    return reasons
+
+
+def _same_exposures(files: Iterable[FrameFile]) -> Reasons:
+    """Files of one exposure, but for the best whose pixels can be used."""
+    reasons: Reasons = {}
+    for group in _groups(files, _moment):
+        ranked = sorted(group, key=lambda each: _rank(each.exposure))
+        odd: Reasons = {}
+        best = ranked[0]
+        for each in ranked if len(ranked) > 1 else ():
+            if not each.fault_of_pixels:
+                best = each
+                break
+            odd[each] = each.fault_of_pixels
+        same = f"the same exposure as {best.name} ({best.exposure.identity}), which is used"
+        reasons |= {each: same for each in ranked if each is not best} | odd
+    return reasons
+
+
+def _groups(
+    files: Iterable[FrameFile], key: Callable[[FrameFile], object]
+) -> Iterable[list[FrameFile]]:
+    """Files with one key; those whose key is None belong to no group."""
     groups: dict[object, list[FrameFile]] = {}
     for each in files:
         value = key(each)
         if value is not None:
             groups.setdefault(value, []).append(each)
-    for group in groups.values():
-        ranked = sorted(group, key=lambda each: _rank(each.exposure))
-        best = ranked[0]
-        if judge is not None and len(ranked) > 1:
-            for each in ranked:
-                judge([each])
-                if not each.reason:
-                    best = each
-                    break
-        for each in ranked:
-            if each is not best and not each.reason:
-                each.reason = reason(best)
+    return groups.values()
 
 
 def _rank(exposure: Exposure) -> int:
@@ -306,106 +250,57 @@ def _rank(exposure: Exposure) -> int:
     return _USABLE.index(level)
 
 
-def _same_file(best: FrameFile) -> str:
-    return f"the same file as {best.name}"
-
-
-def _same_exposure(best: FrameFile) -> str:
-    return f"the same exposure as {best.name} ({best.exposure.identity}), which is used"
-
-
-def require_some(files: Sequence[FrameFile]) -> None:
-    """Raise `NoValidPixelsError`, with the reasons, if every file is excluded."""
-    if not admissible(files):
-        few = "the file cannot" if len(files) == 1 else f"none of {len(files)} files can"
-        raise NoValidPixelsError(f"{few} be used: {reasons_of(files)}")
-
-
-def reasons_of(files: Sequence[FrameFile]) -> str:
-    """Why files are excluded, each reason once with the names of the first files it is for."""
-    names: dict[str, list[str]] = {}
-    for each in files:
-        names.setdefault(each.reason, []).append(each.name)
-    parts = []
-    for reason, those in names.items():
-        more = f" and {len(those) - 3} more" if len(those) > 3 else ""
-        parts.append(f"{', '.join(those[:3])}{more}: {reason}")
-    return "; ".join(parts)
-
-
-# Decide which files belong to a sequence, as what, and why the others do not.
-
-EPOCH = 5.0
-"""Days between frames that may share a wavefront map."""
-
-
-_TWO_STARS = 1.0
-"""arcsec between stars with other names on one date that are not one star."""
-
-
-def choose_filter(files: Sequence[FrameFile], filter: str | None, judge: Judge) -> str:
-    """Exclude frames of other filters; returns the one that is left.
+def choose_filter(admission: Admission, filter: str | None) -> str:
+    """Leave out frames of other filters; returns the one that is left.
 
     IncompatibleSetupError if none was chosen and there are several, or none of the chosen one;
     NoValidPixelsError if no file states its filter.
     """
-    for each in admissible(files):
-        if each.exposure.filter is None:
-            each.reason = "the header does not say through which FILTER it was taken"
-    require_some(files)
-    if filter is None and len({each.exposure.filter for each in admissible(files)}) > 1:
-        judge(files)
-        require_some(files)
-    filter = _the_only("filter", filter, [each.exposure.filter for each in admissible(files)])
-    for each in admissible(files):
-        if not same_name(each.exposure.filter, filter):
-            each.reason = f"taken through {each.exposure.filter}, not {filter}"
-    return filter
+    admission.apply(_without_filter)
+    admission.require_some()
+    if filter is None and len({each.exposure.filter for each in admission.left()}) > 1:
+        admission.apply(with_odd_pixels)
+        admission.require_some()
+    chosen = _the_only("filter", filter, [each.exposure.filter for each in admission.left()])
+    admission.apply(lambda files: {
+        each: f"taken through {each.exposure.filter}, not {chosen}"
+        for each in files if not same_name(each.exposure.filter, chosen)
+    })  # fmt: skip
+    return chosen
+
+
+def _without_filter(files: Iterable[FrameFile]) -> Reasons:
+    reason = "the header does not say through which FILTER it was taken"
+    return {each: reason for each in files if each.exposure.filter is None}
 
 
 def choose_target(
-    files: Sequence[FrameFile], target: str | None, judge: Judge
-) -> tuple[list[FrameFile], list[FrameFile]]:
-    """Tell stars apart: the frames of the target and those of reference stars.
+    admission: Admission, target: str | None
+) -> tuple[str, dict[str, list[FrameFile]]]:
+    """Tell stars apart: the name of the target, and the frames of every star.
 
     IncompatibleSetupError, with the choices, if the target cannot be decided.
     """
-    usable = admissible(files)
-    stars = frames_by_star(usable)
-    if target is None and len(stars) > 1:
+    if target is None and len(frames_by_star(admission.left())) > 1:
         # Which star is the target must not depend on files that cannot be used.
-        judge(usable)
-        require_some(files)
-        usable = admissible(files)
-        stars = frames_by_star(usable)
-    for star, frames in stars.items():
-        for each in frames:
-            each.star = star
-    nameless = [each for each in usable if not each.exposure.star.is_known]
-    if len(usable) == len(nameless) == 1:
-        nameless[0].star = nameless[0].name
-        stars, nameless = {nameless[0].name: nameless}, []
-    if not stars and nameless:
-        unmarked = [each for each in nameless if not each.exposure.reference]
-        if len(unmarked) != 1:
-            raise IncompatibleSetupError(
-                f"target: the files {', '.join(each.name for each in nameless)} do not say of "
-                "which star they are. Add TARGPROP, TARGNAME, or TARG_RA and TARG_DEC"
-            )
-        unmarked[0].star = unmarked[0].name
-        stars, nameless = (
-            {unmarked[0].star: unmarked},
-            [e for e in nameless if e.exposure.reference],
-        )
+        admission.apply(with_odd_pixels)
+        admission.require_some()
+    usable = admission.left()
+    if len(usable) == 1 and not usable[0].exposure.star.is_known:
+        stars = {usable[0].name: usable}
+    else:
+        admission.apply(_nameless)
+        admission.require_some()
+        stars = frames_by_star(admission.left())
     if target is None:
         free = {
             star: frames for star, frames in stars.items()
             if not all(each.exposure.reference for each in frames)
         }  # fmt: skip
         if not free:
-            _require_no_lost_target(files, stars)
-        names = [each.star for frames in (free or stars).values() for each in frames]
-        chosen = _the_only("target", None, names)
+            _require_no_lost_target(admission, stars)
+        choices = free or stars
+        chosen = _the_only("target", None, [star for star in choices for _ in choices[star]])
     else:
         called = [
             star for star, frames in stars.items()
@@ -415,40 +310,43 @@ def choose_target(
             raise unknown_name("target", target, list(stars))
         # Two stars of that name in one folder: the one with more frames.
         chosen = max(called, key=lambda star: len(stars[star]))
-        for star in called:
-            for each in stars[star] if star != chosen else ():
-                each.reason = _namesake(each.exposure.star, stars[chosen][0].exposure.star)
-    references = [e for star, frames in stars.items() if star != chosen for e in frames]
-    for each in nameless:
-        if each.exposure.reference:
-            each.star = f"reference star of {each.name}"
-            references.append(each)
-        else:
-            each.reason = (
-                "the header does not say which star it is. Add TARGPROP, TARGNAME, or TARG_RA and "
-                "TARG_DEC, or IS_PSF for a reference star"
-            )
-    for each in stars[chosen]:
-        if each.for_reference:
-            each.reason = "a reference frame that shows the target itself"
-    return admissible(stars[chosen]), admissible(references)
+        star = stars[chosen][0].exposure.star
+        admission.apply(
+            lambda files: {each: _namesake(each.exposure.star, star) for each in files},
+            [each for name in called if name != chosen for each in stars[name]],
+        )
+    admission.apply(_showing_the_target, stars[chosen])
+    return chosen, stars
 
 
-def _require_no_lost_target(
-    files: Sequence[FrameFile], stars: Mapping[str, Sequence[FrameFile]]
-) -> None:
-    """Refuse to take a reference star for the target because the target's frames are excluded."""
+def _nameless(files: Iterable[FrameFile]) -> Reasons:
+    reason = (
+        "the header does not say which star it is. Add TARGPROP, TARGNAME, or TARG_RA and "
+        "TARG_DEC, or IS_PSF for a reference star"
+    )
+    return {
+        each: reason for each in files
+        if not each.exposure.star.is_known and not each.exposure.reference
+    }  # fmt: skip
+
+
+def _showing_the_target(science: Iterable[FrameFile]) -> Reasons:
+    reason = "a reference frame that shows the target itself"
+    return {each: reason for each in science if each.for_reference}
+
+
+def _require_no_lost_target(admission: Admission, stars: Mapping[str, Sequence[FrameFile]]) -> None:
+    """Refuse to take a reference star for the target because the target's frames are left out."""
     marked = [each.exposure.star for frames in stars.values() for each in frames]
     lost = [
-        each for each in files
-        if not each.exposure.reference
+        each for each in admission.files
+        if each in admission.reasons
+        and not each.exposure.reference
         and not each.is_product
-        # Of some files it is not known which star they show.
-        and (each.reason or not each.exposure.star.is_known)
         and not any(each.exposure.star.is_same(star) for star in marked)
     ]  # fmt: skip
     if lost:
-        reasons = "; ".join(f"{e.name}: {e.reason or 'its star is not known'}" for e in lost)
+        reasons = "; ".join(f"{each.name}: {admission.reasons[each]}" for each in lost)
         raise NoValidPixelsError(
             f"only frames that are marked as references (IS_PSF) can be used, of "
             f"{', '.join(stars)}. Name one of them as the target, or correct the others: {reasons}"
@@ -456,13 +354,14 @@ def _require_no_lost_target(
 
 
 def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
-    """Group frames by star, by the proposer's name that most of them have."""
+    """Group frames by star, by the proposer's name that most of them have.
+
+    Frames of reference stars that are not known are stars of their own.
+    """
     # A frame may be alike to several groups: by its name to one, by its coordinates to another.
     # They then become one.
     groups: list[list[FrameFile]] = []
     for each in files:
-        if not each.exposure.star.is_known:
-            continue
         alike = [
             group for group in groups
             if any(each.exposure.star.is_same(other.exposure.star) for other in group)
@@ -478,6 +377,8 @@ def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
         )
         at = "" if place is None else "at {:.4f} {:+.4f}".format(*place)
         name = names.most_common(1)[0][0][0] if names else f"star {at}"
+        if not group[0].exposure.star.is_known:
+            name = f"reference star of {group[0].name}"
         if name in stars:
             name = f"{name} {at}"
         stars[name] = group
@@ -505,11 +406,11 @@ def _namesake(star: CatalogueStar, target: CatalogueStar) -> str:
     return f"a star of the target's name whose TARG_RA and TARG_DEC are {distance}"
 
 
-def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[FrameFile]) -> None:
-    """Keep the set-up that most of the target's usable frames have."""
-    science, references = admissible(science), admissible(references)
+def of_other_setups(science: Sequence[FrameFile], references: Sequence[FrameFile]) -> Reasons:
+    """Frames without the set-up that most of the target's usable frames have."""
+    reasons: Reasons = {}
     if not science:
-        return
+        return reasons
     counts = Counter(each.exposure.setup for each in science)
     everywhere = Counter(each.exposure.setup for each in (*science, *references))
     lengths: Counter[tuple[str | None, ...]] = Counter()
@@ -534,11 +435,12 @@ def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[Fram
         ]
         if different:
             whose = "the target's frames" if each in references else "most of the target's frames"
-            each.reason = f"another set-up than {whose}: {', '.join(different)}"
+            reasons[each] = f"another set-up than {whose}: {', '.join(different)}"
+    return reasons
 
 
-def exclude_unoriented(science: Sequence[FrameFile]) -> None:
-    """Exclude frames of the target whose roll or date is not known, where there are several.
+def unoriented(science: Sequence[FrameFile]) -> Reasons:
+    """Frames of the target whose roll or date is not known, where there are several.
 
     IncompatibleSetupError if it is known of none of them.
     """
@@ -546,8 +448,9 @@ def exclude_unoriented(science: Sequence[FrameFile]) -> None:
         ("orientation on the sky (ROLL_REF with V3I_YANG)", lambda each: each.position_angle),
         ("date (DATE-BEG, or DATE-OBS with TIME-OBS)", lambda each: each.date),
     )
+    reasons: Reasons = {}
     for fact, value in facts:
-        frames = admissible(science)
+        frames = [each for each in science if each not in reasons]
         unknown = [each for each in frames if value(each.exposure) is None]
         if len(frames) < 2 or not unknown:
             continue
@@ -556,11 +459,50 @@ def exclude_unoriented(science: Sequence[FrameFile]) -> None:
                 f"{', '.join(each.name for each in frames)}: no header states the {fact}, which "
                 "frames that are fitted together need. Add the cards, or reduce one file"
             )
-        for each in unknown:
-            each.reason = (
-                f"the header does not state the {fact}, which frames that are fitted together "
-                "need. Add the cards"
-            )
+        reasons |= dict.fromkeys(
+            unknown,
+            f"the header does not state the {fact}, which frames that are fitted together need. "
+            "Add the cards",
+        )
+    return reasons
+
+
+def copied(files: Sequence[FrameFile]) -> Reasons:
+    """Frames whose pixels are those of another file, whatever the headers say."""
+    return {
+        files[k]: f"its pixels are those of {files[j].name}: a copy of the exposure"
+        for k, j in copies(_frames(files)).items()
+    }
+
+
+def turned(files: Sequence[FrameFile]) -> Reasons:
+    """Frames whose pixels are mirrored or turned, see `why_turned`."""
+    return _contradicting(files, why_turned(_frames(files)))
+
+
+def of_other_brightness(files: Sequence[FrameFile]) -> Reasons:
+    """Frames of one star that is much brighter or fainter in them than in the others."""
+    return _contradicting(files, why_other_brightness(_frames(files)))
+
+
+def _contradicting(files: Sequence[FrameFile], odd: Mapping[int, str]) -> Reasons:
+    """Frames that contradict the others, by reasons for their indices.
+
+    IncompatibleSetupError if half of the target's frames or more do, and nothing says which are
+    right.
+    """
+    if 2 * len(odd) >= len(files) and odd and not files[0].exposure.reference:
+        names = ", ".join(each.name for each in files)
+        raise IncompatibleSetupError(
+            f"{names} contradict each other: for {files[min(odd)].name}, {odd[min(odd)]}. Leave "
+            "out those that are wrong, or correct them"
+        )
+    return {files[k]: reason for k, reason in odd.items()}
+
+
+def _frames(files: Sequence[FrameFile]) -> list[Observation]:
+    """Frames of files that were judged, all of which have some."""
+    return [each.observation for each in files if each.observation is not None]
 
 
 def epochs_of(dates: Sequence[Time | None]) -> list[list[int]]:

@@ -18,6 +18,7 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.units import full_circle, half_circle, rotation_matrix
+from pyklip_diffrender.scene.aligned_frames import on_detector_pixels
 from pyklip_diffrender.scene.exposure import instrument_of, star_of
 from pyklip_diffrender.scene.integrations import (
     Judgement,
@@ -30,7 +31,7 @@ from pyklip_diffrender.scene.integrations import (
     selected,
     weighted_mean,
 )
-from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
+from pyklip_diffrender.scene.jwst_files import read_calints, without_empty
 
 # Boxes of pixels about the star: cutting them out of frames and putting them back.
 
@@ -227,9 +228,6 @@ def _judgement(frames: dict[str, Any], original: NDArray[np.bool_]) -> Judgement
     for remark in judgement.remarks:
         _log.warning("%s: %s", frames["name"], remark)
     return judgement
-
-
-# Observed frames: pixel values, errors, masks, and the position of the star.
 
 
 @dataclass(frozen=True)

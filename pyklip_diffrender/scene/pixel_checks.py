@@ -7,7 +7,7 @@ pointing of the telescope.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from astropy import units as u
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter, map_coordinates, shift, uniform_filter
 from scipy.stats import median_abs_deviation
 
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.scene.admission import FrameFile, admissible
+from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.scene.integrations import dark_pixels
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.simulation import images_of_stars
 from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symmetry, stamp_about
 
 Image = NDArray[np.float64]
@@ -112,11 +112,6 @@ _SYMMETRIES: dict[str, Callable[[Image], Image]] = {
 _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 
 
-Images = Callable[[Observation, float, float], tuple[Image, Image]]
-"""Images of a star behind the mask and of a source at a distance (arcsec) from it, as far as
-another distance (arcsec) about the source, such as `scene.simulation.images_of_stars`."""
-
-
 def why_few_pixels(observation: Observation) -> str:
     """Why the pixels about the star's position say nothing about the star; empty if they do."""
     ny, nx = observation.shape
@@ -147,10 +142,10 @@ def not_judged(observation: Observation) -> str:
     )
 
 
-def why_no_star(observation: Observation, images: Images) -> str:
+def why_no_star(observation: Observation) -> str:
     """Why these cannot be frames of a star behind the mask; empty if they can.
 
-    They are compared with `images` where another source hides the star. Frames that are too small
+    They are compared with the model where another source hides the star. Frames that are too small
     (1.2 arcsec about the star) are not judged.
     """
     stamp = _stamp(observation)
@@ -185,7 +180,7 @@ def why_no_star(observation: Observation, images: Images) -> str:
         return ""
     if np.hypot(*(center_of_pattern(light, distance) * scale)) <= _PATTERN_BEHIND:
         return ""
-    contrast = _contrast_of_source(observation, images)
+    contrast = _contrast_of_source(observation)
     if contrast < _AS_BRIGHT:
         return ""
     x, y = away
@@ -208,10 +203,10 @@ _INSIST = (
 )
 
 
-def _contrast_of_source(observation: Observation, images: Images) -> float:
+def _contrast_of_source(observation: Observation) -> float:
     """Least contrast of the brightest point source beside the star; infinite if it is not one."""
     try:
-        star, source = images(observation, _CORE, _SOURCE)
+        star, source = images_of_stars(observation, _CORE, _SOURCE)
     except DiffrenderError:
         return np.inf
     scale = float(np.mean(observation.pixelscale))
@@ -455,39 +450,3 @@ def _noise(observation: Observation, *, clipped: bool = True) -> tuple[Image, ND
     if typical > 0 and clipped:
         difference = np.clip(difference / typical, -6, 6)
     return difference, usable
-
-
-# Exclude frames by their pixels.
-
-
-def exclude_contradicting(
-    files: Iterable[FrameFile],
-    why: Callable[[Sequence[Observation]], Mapping[int, str]],
-) -> None:
-    """Exclude frames, of files that were read, that contradict the others.
-
-    `why` gives reasons by index, such as `why_turned`. IncompatibleSetupError if half
-    of the target's frames or more have one, and nothing says which are right.
-    """
-    usable = admissible(files)
-    odd = why([_frames(each) for each in usable])
-    if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
-        names = ", ".join(each.name for each in usable)
-        raise IncompatibleSetupError(
-            f"{names} contradict each other: for {usable[min(odd)].name}, {odd[min(odd)]}. Leave "
-            "out those that are wrong, or correct them"
-        )
-    for k, reason in odd.items():
-        usable[k].reason = reason
-
-
-def exclude_copies(files: Iterable[FrameFile]) -> None:
-    """Exclude frames whose pixels are those of another file, whatever the headers say."""
-    usable = admissible(files)
-    for k, j in copies([_frames(each) for each in usable]).items():
-        usable[k].reason = f"its pixels are those of {usable[j].name}: a copy of the exposure"
-
-
-def _frames(file: FrameFile) -> Observation:
-    assert file.observation is not None  # A file that could not be read has a reason.
-    return file.observation

@@ -18,33 +18,23 @@ from astropy.time import Time
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.scene.admission import (
     EPOCH,
-    FrameFile,
-    admissible,
+    Admission,
+    admitted,
     choose_filter,
     choose_target,
+    copied,
     epochs_of,
-    exclude_other_setups,
-    exclude_unoriented,
-    exclude_unusable,
     exposures_in,
-    reasons_of,
-    require_some,
+    of_other_brightness,
+    of_other_setups,
+    turned,
+    unoriented,
+    with_odd_pixels,
     with_references,
 )
 from pyklip_diffrender.scene.exposure import Exposure
-from pyklip_diffrender.scene.integrations import why_odd_noise
+from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.observation import Observation, Window
-from pyklip_diffrender.scene.pixel_checks import (
-    exclude_contradicting,
-    exclude_copies,
-    not_judged,
-    why_few_pixels,
-    why_no_star,
-    why_odd_unit,
-    why_other_brightness,
-    why_turned,
-)
-from pyklip_diffrender.scene.simulation import images_of_stars
 
 # The table of admission: one row for each file, what it is used for, and what it is.
 
@@ -123,33 +113,6 @@ def rows_table(rows: abc.Sequence[Row]) -> QTable:
     table["position_angle"].info.format = ".2f"
     return table
 
-
-# Frames that cannot be used, by their pixels.
-
-
-def judge_frames(files: Iterable[FrameFile]) -> None:
-    """Read files, and exclude those whose pixels cannot be those of a star behind the mask.
-
-    A file is read and judged once. Of frames whose star's position was stated by the user, it is
-    not judged whether the star is there.
-    """
-    for each in admissible(files):
-        if each.observation is not None:
-            continue
-        observation = each.read()
-        if observation is not None:
-            each.reason = (
-                why_few_pixels(observation)
-                or why_odd_noise(observation.noise_ratios)
-                or why_odd_unit(observation)
-                or ("" if each.place is not None else why_no_star(observation, images_of_stars))
-            )
-            remark = not_judged(observation)
-            if remark:
-                each.observation = replace(observation, remarks=(*observation.remarks, remark))
-
-
-# Sequences: the rolls of a target and the reference stars that go with them.
 
 _NEARLY_THE_SAME = 2
 """Pixels by which the stars of two frames may be apart for one window on the detector."""
@@ -279,11 +242,9 @@ class Sequence:
         target: str | None = None,
         filter: str | None = None,
     ) -> Sequence:
-        """Sort files that were opened, see `from_files`, and fill in their reasons."""
-        listed = with_references(files, references)
-        exclude_unusable(listed, judge_frames)
-        require_some(listed)
-        return cls._only(cls._by_epoch(listed, target, filter), None)
+        """Sort files that were opened, see `from_files`."""
+        admission = admitted(with_references(files, references))
+        return cls._only(cls._by_epoch(admission, target, filter), None)
 
     @staticmethod
     def _only(sequences: tuple[Sequence, ...], epoch: str | Time | None) -> Sequence:
@@ -350,52 +311,53 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        # Stars are told apart on copies of the files, because the reasons that this fills in hold
-        # for one filter alone. Where there are several filters, frames are judged first, so that
-        # none is there only by frames that are excluded.
-        listed = _usable(files, references, star, target, filter)
+        # Stars are told apart for every filter alone. Where there are several filters, frames are
+        # judged first, so that none is there only by frames that are left out.
+        usable = _usable(files, references, star, target, filter)
         if filter is not None:
-            return cls._by_epoch(listed, target, filter)
-        science, _ = choose_target([replace(each) for each in listed], target, judge_frames)
-        if len({each.exposure.filter for each in science}) > 1:
-            judge_frames(listed)
-            science, _ = choose_target([replace(each) for each in listed], target, judge_frames)
-        names = {each.exposure.filter for each in science} - {None}
+            return cls._by_epoch(usable, target, filter)
+        chosen, names = _filters_of_target(usable.copy(), target)
+        if len(names) > 1:
+            usable.apply(with_odd_pixels)
+            chosen, names = _filters_of_target(usable.copy(), target)
+        names -= {None}
         if len(names) < 2:
-            return cls._by_epoch(listed, target, next(iter(names), None))
-        name = target or science[0].star
+            return cls._by_epoch(usable, target, next(iter(names), None))
         sequences = [
             each
-            for chosen in sorted(filter_ for filter_ in names if filter_ is not None)
-            for each in cls._by_epoch([replace(file) for file in listed], name, chosen)
+            for name in sorted(name for name in names if name is not None)
+            for each in cls._by_epoch(usable.copy(), target or chosen, name)
         ]
         return tuple(sorted(sequences, key=lambda each: _time(each.science[0])))
 
     @classmethod
     def _by_epoch(
-        cls, listed: list[FrameFile], target: str | None, filter: str | None
+        cls, admission: Admission, target: str | None, filter: str | None
     ) -> tuple[Sequence, ...]:
-        """Sort files that were listed, whose reasons this fills in."""
-        choose_filter(listed, filter, judge_frames)
-        science, others = choose_target(listed, target, judge_frames)
-        star = science[0].star
-        together = [*science, *others]
+        """Sort files of which some are left out already."""
+        choose_filter(admission, filter)
+        star, stars = choose_target(admission, target)
+        science, *others = stars.pop(star), *stars.values()
+        references = [each for group in others for each in group]
+        together = [*science, *references]
         # Only frames that can be used vote for the set-up.
-        judge_frames(together)
-        exclude_other_setups(science, others)
-        exclude_copies(together)
-        exclude_contradicting(together, why_turned)
-        for group in (science, *_by_star(others)):
-            exclude_contradicting(group, why_other_brightness)
-        exclude_unoriented(science)
-        if all(each.reason for each in science):
+        admission.apply(with_odd_pixels, together)
+        admission.apply(of_other_setups, science, references)
+        admission.apply(copied, together)
+        admission.apply(turned, together)
+        for group in (science, *others):
+            admission.apply(of_other_brightness, group)
+        admission.apply(unoriented, science)
+        kept = admission.left(science)
+        if not kept:
             raise NoValidPixelsError(
-                f"{star}: no frames of the target can be used: {reasons_of(science)}"
+                f"{star}: no frames of the target can be used: {admission.in_words(science)}"
             )
-        kept = [each for each in science if not each.reason]
+        names = {each: star for each in science}
+        names |= {each: name for name, group in stars.items() for each in group}
         epochs = epochs_of([each.exposure.date for each in kept])
         return tuple(
-            cls._of_epoch(star, [kept[k] for k in epoch], listed, science) for epoch in epochs
+            cls._of_epoch(star, [kept[k] for k in epoch], admission, names) for epoch in epochs
         )
 
     @classmethod
@@ -403,22 +365,22 @@ class Sequence:
         cls,
         star: str,
         chosen: list[FrameFile],
-        listed: list[FrameFile],
-        science: list[FrameFile],
+        admission: Admission,
+        stars: Mapping[FrameFile, str],
     ) -> Sequence:
         """Make the sequence of one epoch, of which `chosen` are the target's frames."""
         dates = [each.exposure.date for each in chosen if each.exposure.date is not None]
         rows, excluded = [], []
         used: dict[str, list[Observation]] = {"target": [], "reference": []}
         exposures: dict[str, str] = {}
-        for each in listed:
-            reason = each.reason
-            if not reason and each in science and each not in chosen:
+        for each in admission.files:
+            name, reason = stars.get(each, ""), admission.reasons.get(each, "")
+            if not reason and name == star and each not in chosen:
                 day = min(dates).isot[:10]
                 reason = f"of another epoch than the frames of {day}, which have another wavefront"
             if reason:
                 excluded.append((each.name, reason))
-                rows.append(Row("excluded", each.star, each.exposure, None, reason, each.path))
+                rows.append(Row("excluded", name, each.exposure, None, reason, each.path))
                 continue
             use: Literal["target", "reference"] = "target" if each in chosen else "reference"
             observation = each.observation
@@ -432,7 +394,7 @@ class Sequence:
                     remarks.append(f"{OF_ANOTHER_EPOCH}: for the flat-field pattern and KLIP only")
                 remark = "; ".join(remarks)
                 rows.append(
-                    Row(use, each.star, each.exposure, part, remark, each.path, each.for_reference)
+                    Row(use, name, each.exposure, part, remark, each.path, each.for_reference)
                 )
         rows.sort(key=lambda row: (("target", "reference", "excluded").index(row.use), row.time))
         return cls(
@@ -553,13 +515,13 @@ def epochs_of_files(
     Pixels are judged only where the headers leave open which file, filter or target is meant, or
     have several epochs. Raises as `Sequence.from_files`.
     """
-    listed = _usable(files, ())
-    filter = choose_filter(listed, filter, judge_frames)
-    science, _ = choose_target(listed, target, judge_frames)
-    star = science[0].star
+    admission = _usable(files, ())
+    filter = choose_filter(admission, filter)
+    star, stars = choose_target(admission, target)
+    science = admission.left(stars[star])
     if len(epochs_of([each.exposure.date for each in science])) > 1:
-        judge_frames(science)
-        science = admissible(science)
+        admission.apply(with_odd_pixels, science)
+        science = admission.left(science)
     dates = [each.exposure.date for each in science]
     epochs = []
     for group in epochs_of(dates):
@@ -574,22 +536,29 @@ def _usable(
     star: tuple[float, float] | None = None,
     target: str | None = None,
     filter: str | None = None,
-) -> list[FrameFile]:
-    """Files with the reasons of those that cannot be used, of which some are left.
+) -> Admission:
+    """Files of which those that cannot be used are left out.
 
     With a `filter`, its frames are read at once, unless the place of their star is still to come.
     """
     listed = exposures_in(files, references, filter if star is None else None)
     if star is not None:
         place = _star_place(star)
-        marked = all(each.exposure.reference for each in listed if not each.reason)
-        for each in listed:
-            named = target is not None and each.exposure.star.is_called(target)
-            if named or (target is None and (marked or not each.exposure.reference)):
-                each.place = place
-    exclude_unusable(listed, judge_frames)
-    require_some(listed)
-    return listed
+        marked = all(each.exposure.reference for each in listed if not each.fault)
+
+        def is_target(file: FrameFile) -> bool:
+            if target is not None:
+                return file.exposure.star.is_called(target)
+            return marked or not file.exposure.reference
+
+        listed = [replace(each, place=place) if is_target(each) else each for each in listed]
+    return admitted(listed)
+
+
+def _filters_of_target(admission: Admission, target: str | None) -> tuple[str, set[str | None]]:
+    """Name of the target, and the filters of its frames."""
+    chosen, stars = choose_target(admission, target)
+    return chosen, {each.exposure.filter for each in admission.left(stars[chosen])}
 
 
 def _with_segments_joined(
@@ -631,13 +600,6 @@ def _rows(
     for each in observations:
         exposure = Exposure.of(each.header, each.name, each.data.shape)
         yield Row(use, each.target, exposure, each)
-
-
-def _by_star(listed: Iterable[FrameFile]) -> Iterable[list[FrameFile]]:
-    stars: dict[str, list[FrameFile]] = {}
-    for each in listed:
-        stars.setdefault(each.star, []).append(each)
-    return stars.values()
 
 
 def _is_near(date: Time | None, dates: list[Time]) -> bool:

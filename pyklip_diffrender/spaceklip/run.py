@@ -7,7 +7,6 @@ import os
 import warnings
 from collections import abc
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,7 +28,7 @@ from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.pyklip_backend.source_frames import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.reduction import SPECTRA, by_star, in_words, search_together
 from pyklip_diffrender.refinement import to_jansky
-from pyklip_diffrender.scene.admission import FrameFile
+from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.spaceklip.database_files import (
     complete_header,
@@ -274,9 +273,9 @@ def _admitted(key: str, table: Table) -> tuple[Table, JudgedFiles]:
     for path, kind in zip(paths, table["TYPE"], strict=True):
         try:
             opened[path] = OpenedFile.at(path)
-            file = replace(opened[path].file)
+            file = opened[path].file
         except (CorruptFileError, KeyError):
-            file = FrameFile.opened(path, frames=False)  # It says what is wrong.
+            file = FrameFile.opened(path)  # It says what is wrong.
         listed[str(kind) == "SCI"].append(file)
     sequence = Sequence.of_opened(listed[True], listed[False])
     for name, reason in sequence.excluded:

@@ -233,7 +233,6 @@ def _pictures(jobs: Jobs) -> list[Picture]:
         figure,
         "Contrast, relative to the star without coronagraph, that gives S/N "
         f"{sigmas:g}, against separation, for {count(len(curves), 'sequence')}: the median of all "
-        "position angles.",
-        "Circles are candidates." if candidates else "",
+        f"position angles.{' Circles are candidates.' if candidates else ''}",
     )
     return [picture]

@@ -114,8 +114,6 @@ def sensing_terms(path: Path, aperture: str, npix: int) -> tuple[Array, str]:
         return native_float64(camera.data + telescope.data), camera.header["SOURCE"]
 
 
-# Maps of JWST's wavefront-sensing software (WSS) as archived by MAST.
-
 _log = logging.getLogger(__name__)
 
 
