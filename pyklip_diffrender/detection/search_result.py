@@ -35,7 +35,7 @@ from pyklip_diffrender.detection.detection_file import (
     write_detection,
 )
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, Sky, pixels_of
+from pyklip_diffrender.detection.field import Image, Sky, pixels_of, places_of
 from pyklip_diffrender.detection.measurement import (
     candidate_table,
     contrasts_at,
@@ -350,13 +350,30 @@ class Detection:
         """Relative calibration errors of the candidates' contrasts and fluxes, (2, k)."""
         return candidate_errors(self.groups, self.sources, self.error_factor)
 
-    def measure(self, offsets: ArrayLike, *, sigmas: float = 5.0) -> QTable:
+    def measure(
+        self,
+        offsets: ArrayLike | None = None,
+        *,
+        separation: ArrayLike | None = None,
+        position_angle: ArrayLike | None = None,
+        sigmas: float = 5.0,
+    ) -> QTable:
         """Contrast of a point source at given positions, one at a time.
+
+        Positions are either `offsets`, or `separation` with `position_angle`, as in `candidates`;
+        all of them may be quantities.
 
         Parameters
         ----------
-        offsets : (k, 2)
-            x, y from the star, arcsec, image orientation of the first frame.
+        offsets : (k, 2), optional
+            x, y from the star, arcsec, image orientation of the first frame. Figures show offsets
+            to the east and to the north instead: take separation and position angle of a place that
+            is read off one.
+        separation : float or (k,), optional
+            From the star, arcsec.
+        position_angle : float or (k,), optional
+            Degrees east of north, or counter-clockwise from +y of the first frame, if its
+            orientation is not known.
         sigmas : float
             S/N of a detection, below which an upper limit is stated; 3 and 5 are usual.
 
@@ -371,11 +388,18 @@ class Detection:
         Raises
         ------
         IncompatibleSetupError
-            For a position outside the field, or if the detection was read from a file without its
-            fit; see `read`.
+            For a position outside the field, for positions that are given in both ways or in part,
+            or if the detection was read from a file without its fit; see `read`.
         NonFiniteError, ShapeError, UnitError
+
+        Examples
+        --------
+        >>> import pyklip_diffrender as dr
+        >>> found = dr.Detection.read("products")  # doctest: +SKIP
+        >>> found.measure(separation=0.6, position_angle=211)  # doctest: +SKIP
         """
-        raw, calibration = contrasts_at(self._searched[1], offsets, self.error_factor)
+        places = places_of(offsets, separation, position_angle, self.north)
+        raw, calibration = contrasts_at(self._searched[1], places, self.error_factor)
         return measured_table(raw, calibration, self.sky, sigmas)
 
     def measure_shape(self, image: ArrayLike, *, relinearise: float = 25.0) -> tuple[float, float]:
@@ -432,8 +456,8 @@ class Detection:
     def plot(self, ax: Any = None) -> NDArray[Any]:
         """Draw the S/N map with the candidates, and the contrast curve.
 
-        The map is in arcsec from the star; arrows point to north and east where the position angle
-        of the first frame is known.
+        The map has north up and east left, in arcsec from the star, where the position angle of the
+        first frame is known; else it is that of the first frame, in x and y.
 
         Parameters
         ----------

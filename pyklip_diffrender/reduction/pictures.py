@@ -28,7 +28,7 @@ from pyklip_diffrender.detection import (
 from pyklip_diffrender.imaging import SkyModel
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.headers import fits_unit
-from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.io.units import east_and_north, rotation_matrix
 from pyklip_diffrender.reduction.pages import Picture, number, plus_minus
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
@@ -215,7 +215,8 @@ class Overview:
         )  # fmt: skip
         pixel = self.images.grid[0, 1, 0] - self.images.grid[0, 0, 0]
         half = np.abs(self.images.grid).max() + pixel / 2
-        ax.set_xlim(-half, half)
+        # East is left.
+        ax.set_xlim((-half, half) if north is None else (half, -half))
         ax.set_ylim(-half, half)
 
     def kept(self, separations: Sequence[float]) -> tuple[Image, Image | None]:
@@ -491,11 +492,8 @@ def _measured(
     x, y = row["x"].value, row["y"].value
     if "delta_ra" not in row.colnames:
         return ("x", "y"), np.array([row["contrast"], x, y]), covariance
-    angle = np.deg2rad(detection.north)
-    sine, cosine = np.sin(angle), np.cos(angle)
-    # East is -x cos n + y sin n, north x sin n + y cos n; see docs/conventions.md.
     turn = np.eye(3)
-    turn[1:, 1:] = [[-cosine, sine], [sine, cosine]]
+    turn[1:, 1:] = east_and_north(detection.north)
     return ("ΔRA cos Dec", "ΔDec"), turn @ [row["contrast"], x, y], turn @ covariance @ turn.T
 
 

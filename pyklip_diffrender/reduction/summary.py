@@ -18,6 +18,7 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.io.headers import known_number, known_text
 from pyklip_diffrender.io.tables import labelled, plain_rows
+from pyklip_diffrender.io.units import east_and_north
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction.pages import advice, sentence
@@ -295,9 +296,15 @@ def _exposure(frames: Sequence[Observation]) -> float | None:
 
 
 def _bad_pixels(observation: Observation, fitted: FrameFit) -> list[list[float]]:
-    """x, y from the star, arcsec, of good pixels of the file that the fit has left out."""
+    """Good pixels of the file that the fit has left out, in arcsec from the star.
+
+    Offsets to the east and to the north, or x and y where the orientation is not known.
+    """
     left_out = observation.valid.any(axis=0) & ~fitted.observation.valid.any(axis=0)
-    return [[round(float(v), 3) for v in place] for place in fitted.grid[left_out]]
+    places = fitted.grid[left_out]
+    if observation.north is not None:
+        places = places @ east_and_north(observation.north).T
+    return [[round(float(v), 3) for v in place] for place in places]
 
 
 def _settings(settings: Any) -> dict[str, Any]:
