@@ -199,7 +199,7 @@ class WideField:
         )
         write_fits(hdus, written[0])
         for path, table in tables.items():
-            write_table(table, path)
+            write_table(table, path, about.provenance)
         return written
 
 

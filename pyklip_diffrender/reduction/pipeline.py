@@ -258,11 +258,15 @@ class ReductionResult:
 
     def __str__(self) -> str:
         known = "none" if self.systematics is None else f"from {self.systematics.name}"
-        search = self.detection if self.wide is None else self.wide
         return (
             f"{self.sequence!r}\n{self._status}\n"
-            f"flat-field pattern: {known}\n{self._references}{search}\n{self.remark}"
+            f"flat-field pattern: {known}\n{self._references}{self.search}\n{self.remark}"
         ).rstrip()
+
+    @property
+    def search(self) -> Detection | WideField:
+        """The search of the whole frames, if it was asked for, else that of the fitted pixels."""
+        return self.detection if self.wide is None else self.wide
 
     @property
     def _references(self) -> str:

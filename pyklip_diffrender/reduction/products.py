@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import OutputFolder, replacing, write_table
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.io.files import OutputFolder, read_text, replacing, write_table
 from pyklip_diffrender.reduction.pages import (
     FIGURE_FORMATS,
     count,
@@ -222,6 +222,19 @@ _FIGURE = re.compile(
 """Names of the files of figures."""
 
 
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Read ``summary.json`` of a folder; CorruptFileError if it is missing or damaged."""
+    path = folder / "summary.json"
+    try:
+        content: dict[str, Any] = json.loads(read_text(path))
+        return content
+    except (OSError, ValueError) as error:
+        raise CorruptFileError(
+            f"{path}: not the summary of a reduction ({error}). Expected a folder that "
+            "Reduction.write wrote"
+        ) from error
+
+
 def existing_products(folder: Path) -> list[Path]:
     """Files in a folder that are called like products of a reduction."""
     figures = folder / _FIGURES
@@ -265,7 +278,7 @@ def write_products(
     for name, table in tables.items():
         if table is not None:
             written.append(folder / f"{name}.ecsv")
-            write_table(table, written[-1])
+            write_table(table, written[-1], reduction.detection.provenance)
     overview = Overview(SkyImages(reduction), Klip.of(reduction))
     written.append(overview.images.write(folder / "images.fits"))
     written.append(folder / "detection.png")

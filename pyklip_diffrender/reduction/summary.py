@@ -82,6 +82,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
         },
         "wavefront_map": _wavefront_map(fit, first),
         "systematics": _systematics(reduction),
+        "pattern": reduction.pattern,
         "extended": reduction.extended,
         "candidates": _candidates(reduction),
         "wide_field": None if reduction.wide is None else _wide_field(reduction.wide),
