@@ -32,6 +32,7 @@ from pyklip_diffrender.reduction.products import page
 from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.product_headers import world_coordinates
+from pyklip_diffrender.scene.sequence import by_reason
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)
 ROLL = 30.0
@@ -336,6 +337,34 @@ def test_the_summary_has_the_numbers_of_the_result(folder):
     offset = pages.plus_minus(entry["delta_ra_arcsec"], entry["delta_ra_error_arcsec"])
     assert offset in words[at:]
     assert "Flux density (Jy)" not in words
+
+
+@pytest.mark.parametrize(
+    ("days", "chi2", "remarks"),
+    [
+        (6.9, 0.95, ()),
+        (-49.7, 0.95, ("The wavefront map was sensed 50 days after the frames.",)),
+        (49.7, 0.62, ("sensed 50 days before the frames.", "0.62; below 1 because the errors")),
+    ],
+)
+def test_what_a_number_means_is_said_where_it_is_odd(days, chi2, remarks):
+    summary = summarise(reduction())
+    summary["wavefront_map"]["days_before_first_frame"] = days
+    summary["fit"]["reduced_chi2"] = chi2
+    text = page(summary, ReportPictures())
+    assert all(each in text for each in remarks)
+    assert ("is a better start" in text) == (abs(days) > 7)
+    assert ("below 1 because" in text) == (chi2 < 0.9)
+
+
+def test_files_that_are_left_out_for_one_reason_are_one_row():
+    other = [{"name": f"{name}.fits", "reason": "taken through F356W"} for name in "abcd"]
+    summary = summarise(reduction()) | {"left_out": [*other, {"name": "e", "reason": "too faint"}]}
+    text = page(summary, ReportPictures())
+    assert text.count("taken through F356W") == 1
+    assert "4 files, a.fits to d.fits" in text
+    assert "b.fits" not in text
+    assert by_reason([("a", "x"), ("b", "y"), ("c", "x")]) == [("a, c", "x"), ("b", "y")]
 
 
 def test_calibrated_frames_have_flux_densities_on_the_page():

@@ -49,7 +49,7 @@ from pyklip_diffrender.pattern import (
     fit_with_pattern,
     is_known_beside,
 )
-from pyklip_diffrender.reduction.pages import advice
+from pyklip_diffrender.reduction.pages import advice, remark_on_map
 from pyklip_diffrender.reduction.visit import (
     Contribution,
     Joined,
@@ -76,7 +76,7 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import OF_ANOTHER_EPOCH, Sequence
 from pyklip_diffrender.scene.simulation import model_for, within_field
 from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
-from pyklip_diffrender.wavefront.opd import wavefront_for
+from pyklip_diffrender.wavefront.opd import OUTDATED_DAYS, wavefront_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # Whether a fit may be subtracted, and what to say about one that has not converged.
@@ -314,6 +314,10 @@ def prepare(
     """
     wavefront = wavefront_for(opd, sequence.date)
     is_folder = isinstance(opd, str | os.PathLike) and Path(opd).is_dir()
+    days = None if sequence.date is None else wavefront.days_after(sequence.date)
+    # An older one has been warned of.
+    if days is not None and abs(days) <= OUTDATED_DAYS and (remark := remark_on_map(-days)):
+        _log.warning("%s", remark)
 
     def map_for(date: Time | None) -> OPDMap:
         """Of a folder of maps, the one nearest to a date."""

@@ -20,6 +20,7 @@ from pyklip_diffrender.reduction.pages import (
     depth_against_klip,
     number,
     plus_minus,
+    remark_on_map,
     render,
     scientific,
     write_figures,
@@ -27,6 +28,7 @@ from pyklip_diffrender.reduction.pages import (
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import summarise
+from pyklip_diffrender.scene.sequence import by_reason
 
 # The report: what its page shows of a summary, and its pictures.
 
@@ -59,6 +61,8 @@ def page(
         outside=0 if wide is None else len(wide["candidates"]) - len(summary["candidates"]),
         deeper=depth_against_klip(summary["contrast_curve"], summary["klip_curve"]),
         age=_age(summary["wavefront_map"]["days_before_first_frame"]),
+        map_remark=remark_on_map(summary["wavefront_map"]["days_before_first_frame"]),
+        left_out=by_reason((each["name"], each["reason"]) for each in summary["left_out"]),
         provenance=_provenance(summary),
         settings=list(_flat(summary["settings"])),
     )
@@ -117,7 +121,7 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         source = "as stated" if star["source"] == "star_flux" else "from its diffracted light"
         flux = [("Flux density of the star", f"{value} Jy, {source}")]
     return [
-        ("Reduced chi-squared without model error", number(fit["reduced_chi2"])),
+        ("Reduced chi-squared without model error", _chi2(fit["reduced_chi2"])),
         (
             "Error of the star model",
             "none needed" if error == 0 else number(error and 100 * error, ".2g", "% of the star"),
@@ -127,6 +131,16 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Flat-field pattern", _pattern(summary["systematics"])),
         *flux,
     ]
+
+
+def _chi2(value: float | None) -> str:
+    """Reduced chi-squared, and what it means where it is below 1."""
+    if value is None or value >= _SMALL_CHI2:
+        return number(value)
+    return (
+        f"{number(value)}; below 1 because the errors of the frames are larger than their noise, "
+        "as in resampled frames. They are not made smaller"
+    )
 
 
 def _pattern(used: Mapping[str, Any] | None) -> str:
@@ -185,6 +199,11 @@ def _setting(value: Any) -> str:
     if isinstance(value, str) or not isinstance(value, abc.Sequence):
         return str(value)
     return ", ".join(_setting(each) for each in value) or "none"
+
+
+_SMALL_CHI2 = 0.9
+"""Reduced chi-squared below which errors are larger than the noise: of 1,600 pixels, which is the
+smallest number that is fitted as a rule, it has a standard deviation of 0.035."""
 
 
 # The files that a reduction writes.
