@@ -87,7 +87,7 @@ def test_the_page_has_the_combined_map_and_all_limits_side_by_side(tmp_path, mon
     combination = dr.combine(found)
     html, _ = write_comparison(folders, tmp_path, combination)
     assert html.read_text(encoding="utf-8").count("<figure>") == len(figures) == 2
-    (ours, _), (limits, *_) = figures[0].axes, figures[1].axes
+    (ours,), (limits, *_) = figures[0].axes, figures[1].axes
     (row,) = combination.candidates
     (circle,) = (line for line in ours.lines if line.get_label() == "companions")
     place = [row["delta_ra"].value, row["delta_dec"].value]

@@ -125,6 +125,17 @@ def test_contributions_of_reference_frames_are_read_back():
     np.testing.assert_equal(asdict(Visit.from_facts(json.loads(json.dumps(facts)))), asdict(visit))
 
 
+def test_limits_of_a_reduction_are_those_of_its_curve():
+    result = reduction()
+    found, curve = result.limits(), result.contrast_curve
+    assert (
+        found.colnames == result.detection.limits().colnames == ["separation", "contrast", "dmag"]
+    )
+    np.testing.assert_array_equal(found["contrast"], curve["contrast"])
+    np.testing.assert_array_equal(found["separation"], curve["separation"])
+    assert found.meta["filter"] == "F444W"
+
+
 def test_what_is_printed_begins_with_the_sentence_of_the_report(folder):
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     printed = str(reduction())

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.instrument.spectrum import vega_flux_density
 from pyklip_diffrender.io.units import (
     east_and_north,
     full_circle,
@@ -173,11 +174,14 @@ class Sky:
         Flux density of the star, as a catalogue states it or else as fitted, and its standard
         deviation, Jy; None where the frames have no photometric calibration. The error is that of
         the diffracted light or of the catalogue, without that of the calibration.
+    vega : float or None
+        Flux density of Vega magnitude 0 in the filter, Jy; None if it is not known.
     """
 
     north: float | None = None
     mjd: float | None = None
     star: tuple[float, float] | None = None
+    vega: float | None = None
 
     @classmethod
     def of(cls, fits: Sequence[Refinement], scatter: float = 1.0) -> Sky:
@@ -205,6 +209,7 @@ class Sky:
             first.north,
             float(np.mean(known)) if known else None,
             star,
+            vega_flux_density(first.filter),
         )
 
     @property

@@ -44,6 +44,7 @@ from pyklip_diffrender.detection.measurement import (
     measured_table,
     subtracted_frames,
 )
+from pyklip_diffrender.detection.published_limits import published_limits
 from pyklip_diffrender.detection.templates import Group
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
@@ -267,6 +268,46 @@ class Detection:
         )
         table.meta = dict(self.provenance)
         return table
+
+    def limits(self, isochrone: Any = None, *, parallax: Any = None) -> QTable:
+        """Limits as they are published: separation, contrast, magnitudes and, with a model, masses.
+
+        Parameters
+        ----------
+        isochrone : QTable, Table or path, optional
+            An evolutionary model at the age of the star: a column mass (Jupiter masses, or with a
+            unit), and one that is named like the filter, such as F444W or JWST_NIRCam.F444W, with
+            absolute Vega magnitudes, AB magnitudes (unit mag(AB)), or flux densities at 10 pc.
+        parallax : float, Quantity or str, optional
+            Of the star, arcsec or such as "9.3 mas"; needed with `isochrone`.
+
+        Returns
+        -------
+        QTable
+            separation; contrast, the median of all angles in `contrast_curve`; dmag, its
+            magnitude; mag, the apparent Vega magnitude, where the flux density of the star is
+            known; and mass, from which every planet of the model is brighter than the limit, NaN
+            outside of it. Vega has the spectrum alpha_lyr_stis_011 of CALSPEC. Names have no
+            underscores, which LaTeX takes for subscripts.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a model without these columns or with several ages, without a parallax, or frames
+            that are not calibrated.
+        CorruptFileError, FileNotFoundError, UnitError
+            As their names say.
+
+        Examples
+        --------
+        A table for the CDS and one for LaTeX, by the writers of astropy:
+
+        >>> import pyklip_diffrender as dr
+        >>> table = dr.Detection.read("products").limits()  # doctest: +SKIP
+        >>> table.write("limits.txt", format="ascii.mrt")  # doctest: +SKIP
+        >>> table.write("limits.tex", format="ascii.aastex")  # doctest: +SKIP
+        """
+        return published_limits(self.contrast_curve, self, isochrone, parallax)
 
     @property
     def coordinates(self) -> SkyCoord:

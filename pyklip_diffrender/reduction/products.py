@@ -33,7 +33,8 @@ from pyklip_diffrender.scene.sequence import by_reason
 # The report: what its page shows of a summary, and its pictures.
 
 _PHOTOMETRY = (
-    "Flux densities and magnitudes (AB) are those of the source without coronagraph: the "
+    "Flux densities and magnitudes (AB; Vega by CALSPEC's alpha_lyr_stis_011) are those of the "
+    "source without coronagraph: the "
     "transmission of mask and Lyot stop is accounted for. Their errors do not include that of the "
     "pipeline's photometric calibration behind the coronagraph, about 30 % (0.3 mag)."
 )
@@ -88,6 +89,7 @@ _SKY = (
     _Column("Correlation of the two", "{:.2f}".format, "radec_corr"),
     _Column("Flux density (Jy)", scientific, "flux_density_Jy", "flux_density_error_Jy"),
     _Column("AB magnitude", plus_minus, "ab_mag", "ab_mag_error"),
+    _Column("Vega magnitude", plus_minus, "vega_mag", "vega_mag_error"),
 )
 
 

@@ -15,6 +15,7 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 
 from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.detection.published_limits import published_limits
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.options import ReduceKeywords, ReduceOptions
 from pyklip_diffrender.reduction.pipeline import ReductionResult, prepare
@@ -88,6 +89,10 @@ class Reduction(ReductionResult):
     def contrast_curve(self) -> QTable:
         """Limits by separation, to the edge of the whole frames where they were searched."""
         return self.search.contrast_curve
+
+    def limits(self, isochrone: Any = None, *, parallax: Any = None) -> QTable:
+        """Limits as they are published, see `Detection.limits`; of `contrast_curve`."""
+        return published_limits(self.contrast_curve, self.detection, isochrone, parallax)
 
     def plot(self, ax: Any = None) -> NDArray[Any]:
         """Draw the S/N map with the candidates, and the contrast curve.

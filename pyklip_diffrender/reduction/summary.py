@@ -259,7 +259,7 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
             for name in ("contrast", "lowest", "highest", "known_star", "small_sample")
         }
         star = detection.sky.star_jansky
-        known = {} if star is None else _photometry(star * values["contrast"])
+        known = {} if star is None else _photometry(star * values["contrast"], detection.sky.vega)
         rows.append(
             {
                 "separation_arcsec": float(separation_arcsec),
@@ -271,8 +271,10 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
     return rows
 
 
-def _photometry(jansky: float) -> dict[str, float]:
-    return {"flux_density_Jy": jansky, "ab_mag": (jansky * u.Jy).to_value(u.ABmag)}
+def _photometry(jansky: float, vega: float | None) -> dict[str, float]:
+    """Flux density with AB and Vega magnitude; `vega` is the flux density of magnitude 0, Jy."""
+    known = {"flux_density_Jy": jansky, "ab_mag": (jansky * u.Jy).to_value(u.ABmag)}
+    return known if vega is None else known | {"vega_mag": -2.5 * math.log10(jansky / vega)}
 
 
 def _frame(observation: Observation, use: str) -> dict[str, Any]:
