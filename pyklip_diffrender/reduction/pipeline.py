@@ -334,15 +334,15 @@ def prepare(
     sequence = _within_field(sequence)
     if options.wide:
         require_outer_pixels(sequence.science[0], options.side)
-    first, settings, coarser = sequence.science[0], options.settings, {}
-    if options.accuracy == "quick":
-        settings = quick_settings(first.cutout(options.side))
-        coarser = coarse_arguments(first, (options.side, options.side))
+    first, is_quick = sequence.science[0], options.accuracy == "quick"
     if model is None:
+        shape = (options.side, options.side)
+        coarser = coarse_arguments(first, shape) if is_quick else {}
         model = model_for(first, options.side, device=options.device, **coarser)
         cut = sequence.cutout(options.side)
     else:
         cut = sequence.cutout(model.detector.shape, beyond_edges=True)
+    settings = quick_settings(cut.science[0]) if is_quick else options.settings
     science, references = (
         tuple(map(without_blurred_edges, wholes, cuts))
         for wholes, cuts in (
