@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 import pyklip_diffrender as dr
 from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.drawing import compass, halo, light_norm, save
+from pyklip_diffrender.drawing import halo, light_norm, save
 from pyklip_diffrender.reduction.klip import KlipSubtraction, klip_curve
 from pyklip_diffrender.scene.aligned_frames import shift_frames
 
@@ -79,13 +80,27 @@ def draw(reduction: dr.Reduction, subtracted: Image, path: Path) -> None:
             ax.set(title=title, facecolor="0.75", xticks=(-2, 0, 2), yticks=(-2, 0, 2))
             ax.plot(0, 0, "+", color="black", ms=9, mew=1.6, path_effects=halo())
         axes[0].set_ylabel("arcsec")
-        compass(axes[0], frame.position_angle)
+        _compass(axes[0], frame.position_angle)
         bar = {"orientation": "horizontal", "pad": 0.03, "aspect": 12}
         figure.colorbar(artists[0], ax=axes[0], label="MJy/sr", ticks=(1, 100), extend="min",
                         format="%g", **bar)  # fmt: skip
         figure.colorbar(artists[2], ax=axes[1:], label="MJy/sr", ticks=(-10, 0, 10), extend="both",
                         **{**bar, "aspect": 25})  # fmt: skip
         save(figure, path, dpi=300)
+
+
+def _compass(ax: Any, position_angle: float) -> None:
+    """Draw arrows to north and east in the lower left corner, for a +y axis at an angle."""
+    angle = np.deg2rad(position_angle)
+    north, east = np.array([[np.sin(angle), np.cos(angle)], [-np.cos(angle), np.sin(angle)]])
+    # Whichever way the arrows point, they stay inside.
+    tail = 14.0 - 30.0 * np.minimum(0.0, np.minimum(north, east))
+    for letter, arrow in (("N", north), ("E", east)):
+        style = {"arrowstyle": "<-", "lw": 1.4, "shrinkB": 0, "path_effects": halo()}
+        ax.annotate(
+            letter, tail, tail + 30.0 * arrow, xycoords="axes points", textcoords="axes points",
+            ha="center", va="center", path_effects=halo(), arrowprops=style,
+        )  # fmt: skip
 
 
 def main() -> None:

@@ -10,9 +10,9 @@ with it taken away, as for a filter that is not in it, and with the two rolls of
 as reference frames and without; of stars with a disk, these are the four rolls of both M dwarfs.
 KLIP has the same frames. Without references the library's pattern is still that of another star, so
 that only the cases without the library are like with like there. Fits, products and one row of the
-table are kept per case, so that a run that was stopped goes on. For two rolls the table has the 5-sigma
-contrast limits of `reduce` and of KLIP (`klip_curve`: the other roll and the reference frames, the
-best of 1 to 5 modes), both without and with their small-sample corrections, and
+table are kept per case, so that a run that was stopped goes on. For two rolls the table has the
+5-sigma contrast limits of `reduce` and of KLIP (`klip_curve`: the other roll and the reference
+frames, the best of 1 to 5 modes), both without and with their small-sample corrections, and
 "by ring": those of `reduce` with the noise of KLIP's curve, the scatter of the map of contrasts in
 a ring of width lambda/D with the correction of Mawet et al. (2014). "closed" is the part of the gap
 between KLIP's limit and that of a known star which is closed, (KLIP - ours) / (KLIP - known star)

@@ -163,7 +163,7 @@ References: TypeAlias = Literal["joint", "pattern", "off"]
 Accuracy: TypeAlias = Literal["full", "quick"]
 
 
-_SIDE, _QUICK_SIDE = 80, 56
+_SIDE, QUICK_SIDE = 80, 56
 """Default sides of the fitted square, pixels."""
 
 
@@ -368,7 +368,7 @@ class ReduceOptions(SharedOptions):
     @property
     def side(self) -> int:
         """Side of the fitted square, pixels; smaller by default for a first look."""
-        return _QUICK_SIDE if self.size is None and self.accuracy == "quick" else super().side
+        return QUICK_SIDE if self.size is None and self.accuracy == "quick" else super().side
 
     @classmethod
     def from_keywords(cls, keywords: Mapping[str, Any]) -> Self:

@@ -49,6 +49,7 @@ from pyklip_diffrender.pyklip_backend import (
     register,
     unregister,
 )
+from pyklip_diffrender.refinement import GaussNewton
 
 PRODUCT = "x-KLmodes-all.fits"
 
@@ -391,6 +392,8 @@ def test_arguments_that_make_no_sense(settings, change, error, message, imgs, tm
 MISTAKEN = [
     ({"model_options": {"npx": 64}}, "npx: not known to nircam_coronagraph, which has .*npix"),
     ({"model_options": 64}, "model_options: got a int, expected a dict"),
+    ({"accuracy": "fast"}, "accuracy: got 'fast', expected one of full, quick"),
+    ({"accuracy": "quick", "fit": GaussNewton()}, "accuracy, fit: got 'quick' and settings"),
     ({"systematics": "maybe"}, "'maybe', expected 'auto', 'references'"),
     ({"references": "none"}, "references: got 'none', expected one of joint, pattern, off"),
     ({"max_chi2": -1.0}, "max_chi2: got -1.0"),

@@ -141,6 +141,9 @@ def test_products_are_aligned_as_pyklip_aligns_and_keep_its_header(files, refere
     assert dataset.allints.shape == (2, 1, 4, *SHAPE)
     assert (header["DRPIXELS"], header["DRNOISE"], header["DRFILT"]) == ("recorded", "ERR", "F444W")
     assert ours.shape == klip.shape
+    assert header["BUNIT"] == fits.getheader(files[0], "SCI")["BUNIT"] == "MJy/sr"
+    assert "not used" in header.comments["PSFPARAM"]
+    assert "one image" in header.comments["KLMODE0"]
     assert header["DRFILLED"] == 4
     # The flagged pixel of 5000 does not ring: all is noise.
     assert np.isfinite(ours[0]).sum() > 1000

@@ -20,6 +20,7 @@ from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Detection, search
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.units import half_circle
+from pyklip_diffrender.options import QUICK_SIDE
 from pyklip_diffrender.pattern import PatternLibrary
 from pyklip_diffrender.pattern.library import package_library
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
@@ -271,6 +272,34 @@ def test_every_door_begins_the_same_fit(door, aligned, light, tmp_path, calls, e
     assert len({Window.about(each.center[0], each.shape) for each in first.science}) == 2
     assert first is not calls[-1]
     assert_same_call(first, calls[-1])
+
+
+def test_a_first_look_is_the_same_in_every_door(light, tmp_path, calls, monkeypatch):
+    files, made = written(tmp_path, light, aligned=True), []
+
+    def model(observation, size=None, **options):
+        made.append({"size": size, **{name: options[name] for name in ("npix", "nlambda")}})
+        return small_model(observation, size)
+
+    for place in ("reduction.pipeline", "pyklip_backend.subtract"):
+        monkeypatch.setattr(f"pyklip_diffrender.{place}.model_for", model)
+    quick = {"opd": map_file(tmp_path), "accuracy": "quick"}
+    database = StandIn(tmp_path, {KEY: concatenation([str(path) for path in files])})
+    for door in (
+        lambda: dr.reduce(files, **quick),
+        lambda: reduce_jwst_files(files, folder=tmp_path, prefix="x", **quick),
+        lambda: spaceklip.run_obs(database, **quick),
+    ):
+        with contextlib.suppress(Stopped, ExceptionGroup, DiffrenderError):
+            door()
+    assert made[0]["size"] == QUICK_SIDE
+    assert made[0]["nlambda"] in (3, 7)
+    assert made[0] == made[1] == made[2]
+    first, *others = calls
+    assert first.settings.cycles[0] < GaussNewton.nircam("F444W").cycles[0]
+    assert len(others) == 2
+    for each in others:
+        assert_same_call(first, each)
 
 
 @pytest.mark.parametrize(

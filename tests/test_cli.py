@@ -547,6 +547,14 @@ def test_general_options_stand_before_or_after_the_command(
     assert not any(getattr(h, "baseFilename", "") == str(log) for h in logging.root.handlers)
 
 
+@pytest.mark.parametrize(("map_", "said"), [("opd_2022-07-25.fits", 0), ("opd_2022-07-01.fits", 1)])
+def test_a_map_older_than_a_week_has_a_remark(tmp_path, detecting, capsys, map_, said):
+    """The frames are of 2022-07-30."""
+    opd_file(tmp_path / map_)
+    assert main([*detecting, "--opd", str(tmp_path / map_), "--dry-run"]) == 0
+    assert capsys.readouterr().err.count("sensed 29 days before the frames. JWST's is") == said
+
+
 def test_warnings_and_errors_are_messages(tmp_path, detecting, reduced, capsys):
     (tmp_path / "old").mkdir()
     opd_file(tmp_path / "old" / "opd_2020-01-01.fits")

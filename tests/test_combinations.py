@@ -107,7 +107,7 @@ REFUSED = [
     *(
         Refusal("pyklip spaceklip", {name: FEATURES[name].levels[1]}, TypeError, f"'{name}'",
                 NOT_IN_KLIP)
-        for name in ("accuracy", "wide", "injections", "completeness", "memory")
+        for name in ("wide", "injections", "completeness", "memory")
     ),
     Refusal("pyklip spaceklip", {"star": "sed"}, TypeError, "'star_sed'",
             "star_flux_density gives the number that they take"),

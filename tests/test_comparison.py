@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from astropy.io import fits
 
 import pyklip_diffrender as dr
@@ -31,6 +32,9 @@ def summary(mjd, places):
         "target": "AU Mic <b>", "oriented": True, "epoch_mjd": mjd, "sentence": "Result.",
         "first_date": "2022-10-03T00:00:00" if mjd < 60000 else "2023-12-02T00:00:00",
         "filter": "F444W", "candidates": candidates,
+        "contrast_curve": {
+            "sigmas": 5.0, "separation_arcsec": [0.5, 1.0, 1.5], "contrast": [1e-5, 2e-6, None],
+        },
     }  # fmt: skip
 
 
@@ -73,6 +77,33 @@ def test_the_page_shows_the_combined_search(tmp_path):
     # The way of a source in the background is drawn for the candidate.
     assert text.count("by the dashed line. A companion stays") == 1
     assert [each["epoch_mjd"] for each in content["sightings"]] == [59855.0, 60280.0]
+
+
+def test_the_page_has_the_combined_map_and_all_limits_side_by_side(tmp_path, monkeypatch):
+    folders = {"2022": summary(59855.0, []), "2023": summary(60280.0, [])}
+    found = [searched("F444W", k, [(0.5, 0.45, 9.0)], mjd=59855.0 + k) for k in (1, 2)]
+    figures = []
+    monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda f, **_: figures.append(f) or b"")
+    combination = dr.combine(found)
+    html, _ = write_comparison(folders, tmp_path, combination)
+    assert html.read_text(encoding="utf-8").count("<figure>") == len(figures) == 2
+    (ours,), (limits, *_) = figures[0].axes, figures[1].axes
+    (row,) = combination.candidates
+    (circle,) = (line for line in ours.lines if line.get_label() == "companions")
+    place = [row["delta_ra"].value, row["delta_dec"].value]
+    np.testing.assert_allclose(np.ravel(circle.get_data()), place, atol=1e-12)
+    np.testing.assert_allclose(place, (0.5, 0.45), atol=0.03)
+    (image,) = ours.images
+    x, y = (image.get_transform() - ours.transData).inverted().transform(place)
+    left, right, bottom, top = image.get_extent()
+    ny, nx = image.get_array().shape
+    pixel = int((y - bottom) / (top - bottom) * ny), int((x - left) / (right - left) * nx)
+    assert image.get_array()[pixel] == pytest.approx(row["snr"], rel=0.05)
+    drawn = {line.get_label(): line.get_data() for line in limits.lines}
+    assert list(drawn) == ["2022-10-03 F444W", "2023-12-02 F444W", "all together, in F444W"]
+    np.testing.assert_allclose(drawn["2022-10-03 F444W"][1], [1e-5, 2e-6, np.nan])
+    # Each alone has an error of 1e-6 everywhere.
+    np.testing.assert_allclose(drawn["all together, in F444W"][1], 5e-6 / np.sqrt(2), rtol=0.01)
 
 
 def dry_run(folder):

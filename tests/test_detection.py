@@ -662,6 +662,48 @@ def test_positions_may_have_a_unit_and_are_in_the_field(one):
             one.measure(far)
 
 
+def test_positions_may_be_separation_and_position_angle(world, one):
+    planet, angle = FAINT.rotated(-140.0), np.array([140.0])
+    fit = world.refined(world.observed(world.expected(planet), 5, position_angles=angle))
+    found = dr.detect(fit)
+    expected = found.measure([planet.offset])[0]
+    table = found.measure(separation=FAINT.separation, position_angle=FAINT.position_angle)
+    for name in ("x", "y", "contrast", "snr", "separation", "position_angle"):
+        np.testing.assert_allclose(
+            u.Quantity(table[name])[0], u.Quantity(expected[name]), rtol=1e-9
+        )
+    assert table["position_angle"][0].value == pytest.approx(FAINT.position_angle)
+    several = found.measure(
+        separation=[600, 900] * u.mas, position_angle=np.deg2rad(FAINT.position_angle) * u.rad
+    )
+    np.testing.assert_allclose(several["separation"].value, [0.6, 0.9])
+    np.testing.assert_allclose(several["position_angle"].value, FAINT.position_angle)
+    # Counted from +y of a frame whose orientation is not known.
+    (row,) = one.measure(separation=0.6, position_angle=90.0)
+    np.testing.assert_allclose([row["x"].value, row["y"].value], [-0.6, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("positions", "words"),
+    [
+        ({}, "got no position, expected either offsets"),
+        ({"separation": 0.5}, "got separation, expected either"),
+        ({"position_angle": 20.0}, "got position_angle, expected either"),
+        ({"offsets": [[0.1, 0.2]], "separation": 0.5, "position_angle": 2.0},
+         "got offsets and separation and position_angle, expected either"),
+        ({"separation": -0.5, "position_angle": 2.0}, "separation: got -0.5 arcsec.*180 deg"),
+        ({"separation": [0.5, 0.6, 0.7], "position_angle": [1, 2]}, r"shapes \(3,\) and \(2,\)"),
+        ({"separation": 0.5 * u.m, "position_angle": 2.0}, "separation: got the unit"),
+        ({"separation": 0.5, "position_angle": 2.0 * u.s}, "position_angle: got the unit"),
+        ({"separation": 0.5, "position_angle": math.nan}, "position_angle: 1 values are NaN"),
+        ({"separation": 500, "position_angle": 2.0}, "500 arcsec from the star"),
+    ],
+)  # fmt: skip
+def test_positions_that_are_mixed_or_impossible_are_refused(one, positions, words):
+    with pytest.raises(DiffrenderError, match=words):
+        one.measure(**positions)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
@@ -79,14 +81,16 @@ def shown(ax):
 
 
 def place_of(ax, row, column):
-    """x, y of a pixel's centre on the axes."""
+    """Coordinates of a pixel's centre on the axes."""
     (image,) = ax.images
     assert image.origin == "lower"
     left, right, bottom, top = image.get_extent()
     ny, nx = image.get_array().shape
-    return np.array(
-        [left + (column + 0.5) * (right - left) / nx, bottom + (row + 0.5) * (top - bottom) / ny]
+    center = (
+        left + (column + 0.5) * (right - left) / nx,
+        bottom + (row + 0.5) * (top - bottom) / ny,
     )
+    return (image.get_transform() - ax.transData).transform(center)
 
 
 def points(ax, label):
@@ -101,15 +105,17 @@ def label_of(ax):
     return bar.get_ylabel()
 
 
-def arrows(ax):
-    """Unit vectors of the compass, by letter."""
-    found = {each.get_text(): np.subtract(each.xyann, each.xy) for each in ax.texts}
-    return {name: v / np.hypot(*v) for name, v in found.items() if name in "NE"}
+def on_sky(separation, angle):
+    """Offsets to the east and north of a place at a position angle."""
+    return separation * np.array([np.sin(np.deg2rad(angle)), np.cos(np.deg2rad(angle))])
 
 
-def north(angle):
-    """Direction of north in a frame."""
-    return np.array([np.sin(np.deg2rad(angle)), np.cos(np.deg2rad(angle))])
+def assert_north_is_up(ax):
+    """Axes of offsets to the east, which grows to the left, and to the north."""
+    assert [ax.get_xlabel(), ax.get_ylabel()] == ["ΔRA cos Dec (arcsec)", "ΔDec (arcsec)"]
+    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
+    assert left > right
+    assert high > low
 
 
 def test_a_frame_is_drawn_from_its_star(frames):
@@ -123,21 +129,45 @@ def test_a_frame_is_drawn_from_its_star(frames):
     np.testing.assert_array_equal(image[observation.valid[0]], observation.data[observation.valid])
     # The star is where the observation says, in pixels of the image.
     np.testing.assert_allclose(points(ax, "star"), [[0, 0]])
-    np.testing.assert_allclose(place_of(ax, 14, 16) - place_of(ax, 13, 15), observation.pixelscale)
-    offset = (np.array([16, 14]) - observation.center[0]) * observation.pixelscale
-    np.testing.assert_allclose(place_of(ax, 14, 16), offset, atol=1e-12)
+    assert_north_is_up(ax)
+    x, y = (np.array([16, 14]) - observation.center[0]) * observation.pixelscale
+    angle = ANGLES[0] + np.rad2deg(np.arctan2(-x, y))
+    np.testing.assert_allclose(place_of(ax, 14, 16), on_sky(np.hypot(x, y), angle), atol=1e-12)
+    corners = [place_of(ax, row, column) for row in (0, 29) for column in (0, 33)]
+    assert (np.abs(corners) < np.abs([ax.get_xlim()[0], ax.get_ylim()[1]]) + 0.2).all()
+    # Without a position angle, x and y are what is known.
+    plain = replace(observation, position_angles=None).plot()
+    np.testing.assert_allclose(place_of(plain, 14, 16), (x, y), atol=1e-12)
+    assert plain.get_xlabel() == "x from the star (arcsec)"
     assert ax.get_title(loc="left") == "HD 1, F444W"
     assert label_of(ax) == "photon"
 
 
-def test_the_compass_points_where_planets_are(frames):
-    ax = replace(frames[0], position_angles=np.array([200.0])).plot()
-    drawn = arrows(ax)
-    for letter, angle in (("N", 0.0), ("E", 90.0)):
-        expected = replace(PLANET, separation=1.0, position_angle=angle - 200.0).offset
-        np.testing.assert_allclose(drawn[letter], expected, atol=1e-12)
-    # All of it is inside the axes.
-    assert all(min(*each.xy, *each.xyann) > 0 for each in ax.texts)
+@pytest.mark.parametrize("angle", [0.0, 70.0, 200.0])
+def test_what_is_drawn_is_where_its_axes_say(frames, angle):
+    """A bright pixel, in the figure as it is rendered, has the offsets that its axes say."""
+    frame = replace(frames[0], position_angles=np.array([angle]))
+    data, valid = np.ones_like(frame.data), np.ones_like(frame.valid)
+    data[0, 22, 9] = 1e6
+    figure = Figure(figsize=(6, 6), dpi=100)
+    ax = figure.subplots()
+    replace(frame, data=data, valid=valid).plot(ax)
+    for each in (*ax.lines, *ax.child_axes):
+        each.set_visible(False)
+    ax.set_title("", loc="left")
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    rgb = np.asarray(canvas.buffer_rgba())[::-1, :, :3].astype(float)
+    box = ax.get_window_extent()
+    inside = np.zeros(rgb.shape[:2], dtype=bool)
+    inside[int(box.y0) + 3 : int(box.y1) - 2, int(box.x0) + 3 : int(box.x1) - 2] = True
+    # The lightest colour of the scale is nearly white, the other pixels are nearly black.
+    rows, columns = np.nonzero(inside & (rgb[..., 0] > 230))
+    seen = ax.transData.inverted().transform((columns.mean() + 0.5, rows.mean() + 0.5))
+    x, y = (np.array([9, 22]) - frame.center[0]) * frame.pixelscale
+    expected = on_sky(np.hypot(x, y), angle + np.rad2deg(np.arctan2(-x, y)))
+    # A pixel of the screen is 0.006 arcsec, one of the frame ten times as much.
+    np.testing.assert_allclose(seen, expected, atol=0.01)
 
 
 def test_a_system_shows_its_pupils_and_the_star(model):
@@ -189,26 +219,29 @@ def test_a_fit_shows_data_star_and_what_is_left(fit):
     row, column = np.unravel_index(np.argmax(part.companion_image), part.star.shape)
     (place,) = points(residual, "companions")
     assert np.abs(place - place_of(residual, row, column)).max() < 0.07
-    np.testing.assert_allclose(place, in_frame(ANGLES[1]).offset, atol=0.01)
+    np.testing.assert_allclose(place, on_sky(0.6, 100.0), atol=0.01)
     middle = (place_of(data, 0, 0) + place_of(data, 29, 33)) / 2
-    np.testing.assert_allclose(middle, -np.add(AXIS, OFFSET), atol=0.01)
-    np.testing.assert_allclose(arrows(data)["N"], north(ANGLES[1]))
+    x, y = -np.add(AXIS, OFFSET)
+    angle = ANGLES[1] + np.rad2deg(np.arctan2(-x, y))
+    np.testing.assert_allclose(middle, on_sky(np.hypot(x, y), angle), atol=0.01)
+    for ax in axes:
+        assert_north_is_up(ax)
 
 
 def test_a_detection_shows_candidates_and_the_curve(fit):
     found = dr.detect(fit)
     left, right = found.plot()
     np.testing.assert_array_equal(shown(left), found.snr)
-    np.testing.assert_allclose(place_of(left, 4, 7), found.grid[4, 7], atol=1e-12)
+    assert_north_is_up(left)
     (row,) = found.candidates
     circled = points(left, "companions")
-    np.testing.assert_allclose(circled, [[row["x"].value, row["y"].value]])
+    np.testing.assert_allclose(circled, [[row["delta_ra"].value, row["delta_dec"].value]])
+    np.testing.assert_allclose(circled, [on_sky(0.6, 100.0)], atol=0.01)
     peak = np.unravel_index(np.nanargmax(found.snr), found.snr.shape)
-    assert np.abs(circled[0] - found.grid[peak]).max() < 0.07
+    assert np.abs(circled[0] - place_of(left, *peak)).max() < 0.07
     assert f"S/N {row['snr']:.1f}" in [each.get_text() for each in left.texts]
     assert left.get_title(loc="left") == "1 candidate above S/N 5"
     assert label_of(left) == "S/N of a point source"
-    np.testing.assert_allclose(arrows(left)["N"], north(ANGLES[0]))
     curve = found.contrast_curve
     for label, name in (("median", "contrast"), ("star known exactly", "known_star")):
         drawn = points(right, label)

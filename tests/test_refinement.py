@@ -298,9 +298,15 @@ TURNED = dr.Observation.from_arrays(np.ones((20, 24)), np.ones((20, 24)), pixels
         ({"opd": holed}, errors.NonFiniteError, r"1 values inside the pupil.*\(20, 20\)"),
         ({"opd": lambda opd: opd[:, :50]}, errors.ShapeError, "square"),
         ({"observation": TURNED}, errors.ShapeError, r"20 x 24.*24 x 20.*cutout"),
+        ({"observation": "x.fits"}, errors.IncompatibleSetupError, "got 'x.fits', expected an Obs"),
+        ({"observation": ["a.fits", "b.fits"]}, errors.IncompatibleSetupError,
+         r"got 'a\.fits'.*science of Sequence.from_files"),
+        ({"observation": dr.Sequence("HD 1", (TURNED,))}, errors.IncompatibleSetupError,
+         "got Sequence, expected an Observation"),
+        ({"observation": np.ones((3, 3))}, errors.IncompatibleSetupError, "got ndarray"),
         ({"free": ("lyot_shfit",)}, errors.IncompatibleSetupError, r"'lyot_shfit'.*lyot_shift"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_fitted_is_refused(tiny, changes, error, words):
     given = dict(changes)
     changed = copy(tiny)

@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import subprocess
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any, cast
@@ -18,12 +18,13 @@ from astropy.table import QTable
 from astropy.time import Time
 from astropy.wcs import WCS
 from markupsafe import escape
+from matplotlib import pyplot
 from survey_stubs import HOSTILE, Tags
 
 import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.reduction import existing_products, pages, summarise, write_report
 from pyklip_diffrender.reduction.extended_light import looks_extended
 from pyklip_diffrender.reduction.fit_status import advice
@@ -32,6 +33,7 @@ from pyklip_diffrender.reduction.products import page
 from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.product_headers import world_coordinates
+from pyklip_diffrender.scene.sequence import by_reason
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)
 ROLL = 30.0
@@ -44,7 +46,8 @@ def reduction(planet=True, target="HD 1"):
     opd = replace(dr.random_opd(1, npix=128), date=Time("2022-10-01T12:00:00"))
     on_frame = replace(PLANET, position_angle=PLANET.position_angle - ROLL)
     scene = dr.Scene(dr.Star(exposure=20.0), (on_frame,) if planet else ())
-    cards = {"TARGPROP": target, "INSTRUME": "TEST", "CRVAL1": 100.0, "CRVAL2": 20.0}
+    cards = {"TARGPROP": target, "INSTRUME": "TEST", "CRVAL1": 100.0, "CRVAL2": 20.0,
+             "CORONMSK": "MASK335R"}  # fmt: skip
     frame = replace(
         dr.simulate(model, scene, opd, seed=3), header=fits.Header(cards), filter="F444W",
         position_angles=np.array([ROLL - 360]), date=Time("2022-10-03T00:00:00"),
@@ -80,6 +83,78 @@ def test_products_of_another_reduction_are_removed(folder):
     assert not (folder / "wide_field.fits").exists()
     assert not (folder / "systematics.fits").exists()
     assert (folder / "fit.fits").exists()
+
+
+def test_products_are_read_back(folder):
+    first, again = reduction(), dr.Reduction.read(folder)
+    assert str(again) == str(first)
+    for name in ("candidates", "contrast_curve"):
+        expected, table = getattr(first, name), getattr(again, name)
+        assert table.colnames == expected.colnames
+        for column in expected.colnames:
+            np.testing.assert_array_equal(table[column], expected[column])
+    assert again.fit.status is first.fit.status
+    assert again.failed == first.failed
+    assert again.visit == first.visit
+    assert again.sequence.excluded == first.sequence.excluded
+    (frame,), (own,) = again.sequence.science, first.fit.frames
+    np.testing.assert_array_equal(frame.data[frame.valid], own.observation.data[frame.valid])
+    np.testing.assert_array_equal(again.plot()[0].images[0].get_array(), first.detection.snr)
+    pyplot.close("all")
+    with pytest.raises(IncompatibleSetupError, match=r"without the derivatives.*derivatives=True"):
+        again.write(folder / "copy")
+    assert not (folder / "copy").exists()
+
+
+def test_products_that_are_not_read_are_said(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    (copy / "disk.fits").write_text("of a disk", encoding="utf-8")
+    with pytest.warns(DiffrenderWarning, match=r"disk\.fits is not read"):
+        dr.Reduction.read(copy)
+    (copy / "summary.json").unlink()
+    with pytest.raises(CorruptFileError, match=r"summary\.json: not the summary.*Reduction.write"):
+        dr.Reduction.read(copy)
+
+
+def test_contributions_of_reference_frames_are_read_back():
+    frames = (
+        Contribution("a.fits", "HD 2", "wavefront", "", 1.2, 0.5, 3.0),
+        Contribution("b.fits", "HD 3", "not used", "too faint"),
+    )
+    visit = Visit(frames, 1.25)
+    facts = summarise(replace(reduction(), visit=visit))["visit"]
+    np.testing.assert_equal(asdict(Visit.from_facts(json.loads(json.dumps(facts)))), asdict(visit))
+
+
+def test_limits_of_a_reduction_are_those_of_its_curve():
+    result = reduction()
+    found, curve = result.limits(), result.contrast_curve
+    assert (
+        found.colnames == result.detection.limits().colnames == ["separation", "contrast", "dmag"]
+    )
+    np.testing.assert_array_equal(found["contrast"], curve["contrast"])
+    np.testing.assert_array_equal(found["separation"], curve["separation"])
+    assert found.meta["filter"] == "F444W"
+
+
+def test_what_is_printed_begins_with_the_sentence_of_the_report(folder):
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    printed = str(reduction())
+    assert " ".join(printed.split()).startswith(summary["sentence"])
+    assert max(map(len, printed.splitlines()[:3])) <= 80
+
+
+def test_tables_say_what_they_are_of(folder):
+    for name in ("contrast", "candidates"):
+        meta = QTable.read(folder / f"{name}.ecsv").meta
+        assert meta["target"] == "HD 1"
+        assert meta["filter"] == "F444W"
+        assert meta["image_mask"] == "MASK335R"
+        assert meta["opd"] == reduction().fit.initial.name
+        assert meta["status"] == reduction().fit.status.name
+        assert meta["software"] == dr.__version__
+    curve = QTable.read(folder / "contrast.ecsv")
+    assert curve.meta["sigmas"] == reduction().contrast_curve.meta["sigmas"]
 
 
 @pytest.mark.parametrize(
@@ -274,6 +349,34 @@ def test_the_summary_has_the_numbers_of_the_result(folder):
     offset = pages.plus_minus(entry["delta_ra_arcsec"], entry["delta_ra_error_arcsec"])
     assert offset in words[at:]
     assert "Flux density (Jy)" not in words
+
+
+@pytest.mark.parametrize(
+    ("days", "chi2", "remarks"),
+    [
+        (6.9, 0.95, ()),
+        (-49.7, 0.95, ("The wavefront map was sensed 50 days after the frames.",)),
+        (49.7, 0.62, ("sensed 50 days before the frames.", "0.62; below 1 because the errors")),
+    ],
+)
+def test_what_a_number_means_is_said_where_it_is_odd(days, chi2, remarks):
+    summary = summarise(reduction())
+    summary["wavefront_map"]["days_before_first_frame"] = days
+    summary["fit"]["reduced_chi2"] = chi2
+    text = page(summary, ReportPictures())
+    assert all(each in text for each in remarks)
+    assert ("is a better start" in text) == (abs(days) > 7)
+    assert ("below 1 because" in text) == (chi2 < 0.9)
+
+
+def test_files_that_are_left_out_for_one_reason_are_one_row():
+    other = [{"name": f"{name}.fits", "reason": "taken through F356W"} for name in "abcd"]
+    summary = summarise(reduction()) | {"left_out": [*other, {"name": "e", "reason": "too faint"}]}
+    text = page(summary, ReportPictures())
+    assert text.count("taken through F356W") == 1
+    assert "4 files, a.fits to d.fits" in text
+    assert "b.fits" not in text
+    assert by_reason([("a", "x"), ("b", "y"), ("c", "x")]) == [("a, c", "x"), ("b", "y")]
 
 
 def test_calibrated_frames_have_flux_densities_on_the_page():

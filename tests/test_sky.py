@@ -19,8 +19,10 @@ from pyklip_diffrender.detection.detection_file import write_astrometry
 from pyklip_diffrender.detection.error_factor import ErrorFactor, contrast_table
 from pyklip_diffrender.detection.field import Positions, Sky
 from pyklip_diffrender.detection.measurement import candidate_table, measured_table
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument import detector_place
+from pyklip_diffrender.detection.published_limits import published_limits
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.instrument import FILTERS, detector_place
+from pyklip_diffrender.instrument.spectrum import vega_flux_density
 from pyklip_diffrender.refinement import jansky_per_unit, require_calibrated, to_jansky
 from pyklip_diffrender.scene import Observation, world_coordinates
 
@@ -151,6 +153,138 @@ def test_the_flux_of_a_planet_does_not_have_the_error_of_the_stars_flux():
     assert row["flux_density"].to_value("Jy") == pytest.approx(0.4 * row["contrast"])
     assert row["ab_mag"].value == pytest.approx(row["flux_density"].to_value(u.ABmag))
     assert row["ab_mag_error"].value == pytest.approx(2.5 / np.log(10) * share)
+
+
+def test_the_table_has_the_whole_covariance_of_each_candidate(rng):
+    """Against draws of contrast, x and y, whose offsets are turned as complex numbers."""
+    truth = np.array([[1e-10, 4e-9, -3e-9], [4e-9, 4e-6, 1.5e-6], [-3e-9, 1.5e-6, 1e-6]])
+    start = Candidates.at([[0.2, -0.8]], [2e-4])
+    known = Candidates(start.offsets, start.contrasts, torch.tensor(truth), 0.08 * start.contrasts)
+    factor, calibration = ErrorFactor.constant(1.5), np.array([[0.1], [0.02]])
+    drawn = rng.multivariate_normal([2e-4, 0.2, -0.8], 1.5**2 * truth, size=40_000)
+    contrast = drawn[:, 0] + 0.1 * 2e-4 * rng.normal(size=40_000)
+    sky = (drawn[:, 2] - 1j * drawn[:, 1]) * np.exp(1j * np.deg2rad(NORTH))
+    (row,) = candidate_table(known, factor, calibration, SKY)
+    (blind,) = candidate_table(known, factor, calibration, Sky())
+    assert row["contrast_error"] == pytest.approx(contrast.std(), rel=0.02)
+    for table_, name, pair in (
+        (row, "contrast_ra_corr", (contrast, sky.imag)),
+        (row, "contrast_dec_corr", (contrast, sky.real)),
+        (row, "radec_corr", (sky.imag, sky.real)),
+        (blind, "contrast_x_corr", (contrast, drawn[:, 1])),
+        (blind, "contrast_y_corr", (contrast, drawn[:, 2])),
+        (blind, "xy_corr", (drawn[:, 1], drawn[:, 2])),
+    ):
+        # Of 40,000 draws, a correlation is known to 0.005.
+        assert table_[name] == pytest.approx(np.corrcoef(*pair)[0, 1], abs=0.02), name
+        assert abs(table_[name]) > 0.1, name
+
+
+def test_vega_is_as_bright_as_in_filters_of_spitzer():
+    """IRAC's zero points, 280.9 and 179.7 Jy at 3.550 and 4.493 micron (Reach et al. 2005).
+
+    With a power law through the two. Calibrations of Vega differ by 2 to 3 %.
+    """
+    slope = np.log(280.9 / 179.7) / np.log(3.550 / 4.493)
+    for name, pivot in (("F356W", 3.568), ("F444W", 4.404), ("F410M", 4.082)):
+        expected = 179.7 * (pivot / 4.493) ** slope
+        assert vega_flux_density(name) == pytest.approx(expected, rel=0.04)
+    assert None not in {vega_flux_density(each) for each in FILTERS}
+    assert vega_flux_density("F1140C") is vega_flux_density(None) is None
+
+
+def test_magnitudes_of_vega_are_those_of_its_flux_density():
+    sky = Sky(star=(18.4115, 0.1), vega=vega_flux_density("F444W"))
+    row = table(sky)[1]
+    # A star of a tenth of Vega's flux density has magnitude 2.5.
+    assert row["vega_mag"].value == pytest.approx(2.5 + row["delta_mag"].value, abs=1e-4)
+    assert row["vega_mag_error"].value == pytest.approx(row["ab_mag_error"].value)
+    assert "vega_mag" not in table(SKY).colnames
+
+
+CURVE = QTable({"separation": [0.3, 0.6, 1.2] * u.arcsec, "contrast": [1e-5, 1e-6, np.nan]})
+CURVE.meta["sigmas"] = 5.0
+MASSES = np.geomspace(0.5, 50, 9)
+MODEL = QTable({"mass": MASSES, "F444W": MASSES})
+
+
+def seen(sky, filter="F444W"):
+    """What `published_limits` needs of a detection."""
+    frame = SimpleNamespace(filter=filter)
+    return SimpleNamespace(sky=sky, observation=frame, provenance={"target": "HD 1"})
+
+
+BRIGHT = Sky(star=(0.4, 0.04), vega=184.0)
+
+
+def test_limits_are_written_for_the_cds_and_for_latex(tmp_path):
+    found = published_limits(CURVE, seen(BRIGHT), None, None)
+    assert found.colnames == ["separation", "contrast", "dmag", "mag"]
+    np.testing.assert_allclose(found["dmag"].value, [12.5, 15.0, np.nan])
+    star = -2.5 * np.log10(0.4 / 184.0)
+    np.testing.assert_allclose(found["mag"].value, np.array([12.5, 15.0, np.nan]) + star)
+    assert (found.meta["target"], found.meta["sigmas"]) == ("HD 1", 5.0)
+    for form in ("ascii.mrt", "ascii.aastex", "ascii.ecsv"):
+        found.write(tmp_path / form, format=form)
+    again = ascii.read(str(tmp_path / "ascii.mrt"), format="mrt")
+    assert again["dmag"][1] == 15.0
+    assert again["separation"].unit == "arcsec"
+    text = (tmp_path / "ascii.aastex").read_text(encoding="utf-8")
+    assert "0.60 & 1.00e-06 & 15.00 & 21.66" in text
+    assert "_" not in text
+    assert "mag" not in published_limits(CURVE, seen(Sky()), None, None).colnames
+
+
+@pytest.mark.parametrize("parallax", [0.02, 20 * u.mas, "20 mas"])
+def test_masses_are_those_of_a_power_law(tmp_path, parallax):
+    """Planets of 1e-6 Jy (M / M_J)^2 at 10 pc, so that interpolation of logarithms is exact."""
+    flux = 1e-6 * MASSES**2
+    # At 50 pc, 25 times fainter.
+    expected = np.sqrt(25 * 0.4 * np.array([1e-5, 1e-6, np.nan]) / 1e-6)
+    vega = QTable({"mass": MASSES, "JWST/NIRCam.F444W": -2.5 * np.log10(flux / 184.0)})
+    models = [
+        vega,
+        QTable({"Mass": MASSES[::-1] * u.jupiterMass, "F444W": (flux[::-1] * u.Jy).to(u.nJy)}),
+        QTable({"mass": (MASSES * u.M_jup).to("solMass"), "f444w": (flux * u.Jy).to("mag(AB)")}),
+        tmp_path / "model.ecsv",
+    ]
+    vega.write(models[-1])
+    for model in models:
+        found = published_limits(CURVE, seen(BRIGHT), model, parallax)
+        np.testing.assert_allclose(found["mass"].to_value(u.jupiterMass), expected)
+
+
+def test_masses_are_those_from_which_all_planets_are_seen():
+    """Where deuterium burns, less massive planets are brighter."""
+    model = QTable({"mass": [1.0, 10.0, 13.0, 20.0], "F444W": [1e-7, 1e-5, 1e-6, 1e-4] * u.Jy})
+    curve = QTable({"separation": [1.0, 1.0, 1.0] * u.arcsec, "contrast": [3e-6, 1e-8, 1.0]})
+    curve.meta["sigmas"] = 5.0
+    found = published_limits(curve, seen(Sky(star=(1.0, 0.1))), model, 0.1)
+    # 3e-6 Jy is below the planet of 10 masses, but only from 13 on all are brighter.
+    assert 13 < found["mass"][0].value < 20
+    assert np.isnan(found["mass"][1:].value).all()
+
+
+@pytest.mark.parametrize(
+    ("model", "parallax", "sky", "words"),
+    [
+        (MODEL, None, BRIGHT, "parallax: got None, expected"),
+        (MODEL, 20.0, BRIGHT, "parallax: got 20 arcsec.*20 mas"),
+        (MODEL, 0.02, Sky(), "no photometric calibration"),
+        (QTable({"mass": MASSES, "F356W": MASSES}), 0.02, BRIGHT, "0 columns of F444W among mass"),
+        (QTable({"M": MASSES, "F444W": MASSES}), 0.02, BRIGHT, "0 columns of mass among M, F444W"),
+        (QTable({"mass": MASSES, "F444W": MASSES, "NIRCam.F444W": MASSES}), 0.02, BRIGHT,
+         "2 columns of F444W"),
+        (QTable({"mass": [1.0, 2.0, 1.0], "F444W": [3.0, 2.0, 1.0]}), 0.02, BRIGHT,
+         "3 rows with 2 masses.*choose one"),
+        (QTable({"mass": MASSES, "F444W": MASSES * u.m}), 0.02, BRIGHT, "got F444W in m, expected"),
+        (MODEL, 0.02, Sky(star=(1.0, 0.1)), "Vega in F444W"),
+        (__file__, 0.02, BRIGHT, "test_sky.py: not a table"),
+    ],
+)  # fmt: skip
+def test_models_that_say_no_masses_are_refused(model, parallax, sky, words):
+    with pytest.raises(DiffrenderError, match=words):
+        published_limits(CURVE, seen(sky), model, parallax)
 
 
 def test_what_is_not_detected_has_an_upper_limit():

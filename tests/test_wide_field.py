@@ -347,7 +347,8 @@ def test_the_map_has_north_up_and_numbered_circles(crowded):
     (fit,) = detection.fits
     part = replace(fit.frames[0], observation=turned.cutout(24))
     oriented = replace(wide, detection=replace(detection, fits=(replace(fit, frames=(part,)),)))
-    for each, turn in ((wide, lambda x, y: (x, y)), (oriented, lambda x, y: (-y, x))):
+    # With +y at a position angle of 90 degrees, +y is east and +x is north.
+    for each, turn in ((wide, lambda x, y: (x, y)), (oriented, lambda x, y: (y, x))):
         ax, _ = each.plot()
         labels = {text.get_text(): text.xy for text in ax.texts if text.get_text().isdigit()}
         assert len(labels) == len(wide.candidates)
@@ -358,8 +359,9 @@ def test_the_map_has_north_up_and_numbered_circles(crowded):
             (image,) = ax.images
             left, right, bottom, top = image.get_extent()
             ny, nx = image.get_array().shape
-            column = int((place[0] - left) / (right - left) * nx)
-            line = int((place[1] - bottom) / (top - bottom) * ny)
+            x, y = (image.get_transform() - ax.transData).inverted().transform(place)
+            column = int((x - left) / (right - left) * nx)
+            line = int((y - bottom) / (top - bottom) * ny)
             near = image.get_array()[line - 1 : line + 2, column - 1 : column + 2]
             assert near.max() > 0.6 * row["snr"] if row["shape"] != "extended" else near.max() > 5
 

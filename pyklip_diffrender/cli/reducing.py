@@ -40,7 +40,7 @@ from pyklip_diffrender.reduction import (
     write_comparison,
 )
 from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
-from pyklip_diffrender.scene.sequence import SHORT, Sequence
+from pyklip_diffrender.scene.sequence import SHORT, Sequence, by_reason
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
 from pyklip_diffrender.wavefront.opd_map import OPDMap
@@ -289,8 +289,8 @@ def _show(sequence: Sequence) -> None:
     for row in used:
         if row["remark"]:
             click.echo(f"{row['file']}: {row['remark']}")
-    for name, reason in sequence.excluded:
-        click.echo(f"left out: {name}: {reason}")
+    for names, reason in by_reason(sequence.excluded):
+        click.echo(f"left out: {names}: {reason}")
 
 
 def map_for(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:

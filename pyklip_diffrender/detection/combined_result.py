@@ -15,6 +15,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.association import Hypotheses, Motion
 from pyklip_diffrender.detection.field import (
     Image,
@@ -241,8 +242,14 @@ class Combination:
             hdus["SNR"].header[f"SPEC{k}"] = fits_text(name)
         hdus.append(text_hdu("FACTS", self.to_dict()))
         write_fits(hdus, paths[0])
-        write_table(self.candidates, paths[1])
-        write_table(self.limits, paths[2])
+        facts = {
+            "software": __version__,
+            "target": self.target,
+            "filters": list(self.spectra.filters),
+            "reductions": [each.name for each in self.maps],
+        }
+        write_table(self.candidates, paths[1], facts)
+        write_table(self.limits, paths[2], facts)
         return paths
 
 

@@ -21,7 +21,7 @@ from pyklip_diffrender.detection.field import Image, Sky
 from pyklip_diffrender.detection.templates import Group, groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing, require_new, write_fits, write_table
-from pyklip_diffrender.io.headers import fits_unit
+from pyklip_diffrender.io.headers import fits_unit, known_text
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.fit_file import (
     image,
@@ -312,8 +312,12 @@ def digest(fit: Refinement) -> str:
 
 def provenance_of(detection: Any) -> dict[str, object]:
     """Facts about the fits and the search of a `Detection`, by name."""
+    first = detection.observation
     return {
         "software": __version__,
+        "target": first.target,
+        "filter": first.filter,
+        "image_mask": known_text(first.header, "CORONMSK"),
         "observations": [f.observation.name for fit in detection.fits for f in fit.frames],
         **detection.fits[0].summary(),
         "scatter": detection.scatter,
@@ -344,7 +348,7 @@ def write_detection(detection: Any, folder: Path, *, overwrite: bool) -> list[Pa
         write_fits(_hdus_of(detection.other), beside)
         written.append(beside)
     for path, table in tables.items():
-        write_table(table, path)
+        write_table(table, path, detection.provenance)
         written.append(path)
     if detection.sky.north is None or detection.sky.mjd is None:
         positions.unlink(missing_ok=True)

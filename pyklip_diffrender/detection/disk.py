@@ -263,7 +263,8 @@ class Disk:
             drawing.signed_image(each, image, self.grid, limit, bar=bar, title=title, north=north)
         if self.hides_points.any():
             axes[1].contour(
-                *np.moveaxis(self.grid, -1, 0), self.hides_points, levels=[0.5],
+                *np.moveaxis(drawing.on_sky(self.grid, north), -1, 0), self.hides_points,
+                levels=[0.5],
                 colors="0.3", linestyles="dashed", linewidths=1,
             )  # fmt: skip
         return np.array(axes)

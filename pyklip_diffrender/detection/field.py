@@ -11,8 +11,15 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import full_circle, require_finite, to_arcsec
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.instrument.spectrum import vega_flux_density
+from pyklip_diffrender.io.units import (
+    east_and_north,
+    full_circle,
+    require_finite,
+    to_arcsec,
+    to_unit,
+)
 from pyklip_diffrender.refinement import Refinement, jansky_per_unit, star_flux_error
 
 Image = NDArray[np.float64]
@@ -56,6 +63,49 @@ def is_within(region: NDArray[np.bool_], grid: Image, offsets: Image) -> NDArray
     nearest = np.rint(pixels_of(grid, offsets)).astype(int)
     columns, rows = np.clip(nearest, 0, np.array(region.shape[::-1]) - 1).T
     return np.asarray(region[rows, columns])
+
+
+def places_of(
+    offsets: ArrayLike | None,
+    separation: ArrayLike | None,
+    position_angle: ArrayLike | None,
+    north: float,
+) -> ArrayLike:
+    """x, y from the star, (k, 2), of positions that are stated in one of two ways.
+
+    `north` is the position angle of the +y axis. Raises `IncompatibleSetupError` for both ways
+    together, or for one of separation and position angle alone, `ShapeError` for numbers of them
+    that differ, and `NonFiniteError` or `UnitError`.
+    """
+    given = {
+        "offsets": offsets, "separation": separation, "position_angle": position_angle,
+    }  # fmt: skip
+    names = [name for name, value in given.items() if value is not None]
+    if names == ["offsets"]:
+        assert offsets is not None
+        return offsets
+    if names != ["separation", "position_angle"]:
+        raise IncompatibleSetupError(
+            f"measure: got {' and '.join(names) or 'no position'}, expected either offsets (x, y) "
+            "or separation and position_angle"
+        )
+    polar = to_arcsec(separation, "separation"), to_unit(position_angle, "deg", "position_angle")
+    for values, name in zip(polar, names, strict=True):
+        require_finite(values, name)
+    if (polar[0] < 0).any():
+        raise IncompatibleSetupError(
+            f"separation: got {polar[0].min():g} arcsec, expected 0 or more. The opposite side of "
+            "the star has a position angle that differs by 180 deg"
+        )
+    try:
+        distance, angle = np.broadcast_arrays(*map(np.atleast_1d, polar))
+    except ValueError as error:
+        shapes = " and ".join(str(each.shape) for each in polar)
+        raise ShapeError(
+            f"separation, position_angle: got shapes {shapes}, expected one of each for every place"
+        ) from error
+    turned = np.deg2rad(angle - north)
+    return np.stack([-distance * np.sin(turned), distance * np.cos(turned)], axis=-1)
 
 
 def require_inside(offsets: Image, grid: Image) -> None:
@@ -131,11 +181,14 @@ class Sky:
         Flux density of the star, as a catalogue states it or else as fitted, and its standard
         deviation, Jy; None where the frames have no photometric calibration. The error is that of
         the diffracted light or of the catalogue, without that of the calibration.
+    vega : float or None
+        Flux density of Vega magnitude 0 in the filter, Jy; None if it is not known.
     """
 
     north: float | None = None
     mjd: float | None = None
     star: tuple[float, float] | None = None
+    vega: float | None = None
 
     @classmethod
     def of(cls, fits: Sequence[Refinement], scatter: float = 1.0) -> Sky:
@@ -163,6 +216,7 @@ class Sky:
             first.north,
             float(np.mean(known)) if known else None,
             star,
+            vega_flux_density(first.filter),
         )
 
     @property
@@ -209,18 +263,12 @@ class Positions:
     @property
     def on_sky(self) -> Image:
         """Offsets to the east (dRA cos Dec) and to the north (dDec), arcsec, (k, 2)."""
-        return self.offsets @ self._to_sky.T
-
-    @property
-    def _to_sky(self) -> NDArray[np.float64]:
-        """Matrix from x, y to east, north: a reflection, because east is left of north."""
-        sine, cosine = np.sin(np.deg2rad(self.north)), np.cos(np.deg2rad(self.north))
-        return np.array([[-cosine, sine], [sine, cosine]])
+        return self.offsets @ east_and_north(self.north).T
 
     @property
     def sky_covariance(self) -> Image:
         """Covariance of the offsets to the east and to the north, arcsec^2, (k, 2, 2)."""
-        turn = self._to_sky
+        turn = east_and_north(self.north)
         return np.asarray(turn @ self.covariance @ turn.T)
 
     @property

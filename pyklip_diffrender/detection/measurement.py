@@ -31,7 +31,7 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.detection.templates import Group, has_only_reference_stars, weigh
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.tables import Column, add_columns
-from pyklip_diffrender.io.units import to_arcsec
+from pyklip_diffrender.io.units import east_and_north, to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
@@ -160,12 +160,9 @@ def candidate_table(
     factors = factor.of(candidates.offsets)
     error = factors * candidates.errors.numpy()[:, 0]
     # Of the covariance of all candidates, each one's own part by contrast, x and y.
-    covariance = candidates.covariance.numpy().reshape(3, count, 3, count)
-    positions = Positions(
-        candidates.offsets.numpy(),
-        factors[:, None, None] ** 2 * np.einsum("akbk->kab", covariance)[:, 1:, 1:],
-        sky.north or 0.0,
-    )
+    shared = candidates.covariance.numpy().reshape(3, count, 3, count)
+    covariance = factors[:, None, None] ** 2 * np.einsum("akbk->kab", shared)
+    positions = Positions(candidates.offsets.numpy(), covariance[:, 1:, 1:], sky.north or 0.0)
     separation_error, angle_error, polar = deviations_and_correlation(positions.polar_covariance)
     x_error, y_error, _ = deviations_and_correlation(positions.covariance)
     contrast_error = np.hypot(error, contrast * calibration[0])
@@ -177,6 +174,7 @@ def candidate_table(
         ("position_angle_error", angle_error, u.deg, ".2f", "standard deviation"),
         ("seppa_corr", polar, None, ".3f", "correlation of separation and position angle"),
         *_on_sky(positions, sky),
+        *_correlations(covariance, contrast_error, sky),
         *_epoch(count, sky),
         ("frame_angle", positions.frame_angle, u.deg, ".2f",
          "counter-clockwise from +y of the first frame; its error is that of the position angle"),
@@ -264,6 +262,24 @@ def _on_sky(positions: Positions, sky: Sky) -> Iterator[Column]:
     yield "radec_corr", correlation, None, ".3f", "correlation of delta_ra and delta_dec"
 
 
+def _correlations(covariance: Image, contrast_error: Image, sky: Sky) -> Iterator[Column]:
+    """Correlations with which errors of contrasts and offsets make a covariance (k, 3, 3).
+
+    The covariance is that of contrast, x and y; the error of the contrast has further parts.
+    """
+    turn, names = np.eye(3), ("x", "y")
+    if sky.north is not None:
+        turn[1:, 1:], names = east_and_north(sky.north), ("ra", "dec")
+    else:
+        *_, correlation = deviations_and_correlation(covariance[:, 1:, 1:])
+        yield "xy_corr", correlation, None, ".3f", "correlation of x and y"
+    turned = turn @ covariance @ turn.T
+    for k, name in enumerate(names, 1):
+        values = turned[:, 0, k] / (contrast_error * np.sqrt(turned[:, k, k]))
+        about = f"correlation of contrast and {name if sky.north is None else f'delta_{name}'}"
+        yield f"contrast_{name}_corr", values, None, ".3f", about
+
+
 def _photometry(contrast: Image, error: Image, flux_error: Image, sky: Sky) -> Iterator[Column]:
     yield "contrast", contrast, None, ".3e", "flux over that of the star, without coronagraph"
     yield "contrast_error", error, None, ".1e", "with those of the star's flux and the image"
@@ -275,9 +291,12 @@ def _photometry(contrast: Image, error: Image, flux_error: Image, sky: Sky) -> I
     jansky, jansky_error = contrast * sky.star[0], flux_error * sky.star[0]
     yield "flux_density", jansky, u.Jy, ".3e", "in the photometric calibration of the frames"
     yield "flux_density_error", jansky_error, u.Jy, ".1e", "without that of the calibration"
-    magnitude, magnitude_error = magnitudes(jansky / _AB_ZERO, jansky_error / _AB_ZERO)
-    yield "ab_mag", magnitude, u.mag, ".3f", "AB magnitude of flux_density"
-    yield "ab_mag_error", magnitude_error, u.mag, ".3f", "without that of the calibration"
+    for system, zero in (("AB", _AB_ZERO), ("Vega", sky.vega)):
+        if zero is not None:
+            magnitude, magnitude_error = magnitudes(jansky / zero, jansky_error / zero)
+            name = f"{system.lower()}_mag"
+            yield name, magnitude, u.mag, ".3f", f"{system} magnitude of flux_density"
+            yield f"{name}_error", magnitude_error, u.mag, ".3f", "without that of the calibration"
 
 
 def _epoch(count: int, sky: Sky) -> Iterator[Column]:

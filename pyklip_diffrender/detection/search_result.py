@@ -36,7 +36,7 @@ from pyklip_diffrender.detection.detection_file import (
     write_detection,
 )
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, Sky, is_within, pixels_of
+from pyklip_diffrender.detection.field import Image, Sky, is_within, pixels_of, places_of
 from pyklip_diffrender.detection.measurement import (
     candidate_table,
     contrasts_at,
@@ -45,6 +45,7 @@ from pyklip_diffrender.detection.measurement import (
     measured_table,
     subtracted_frames,
 )
+from pyklip_diffrender.detection.published_limits import published_limits
 from pyklip_diffrender.detection.templates import Group
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
@@ -274,6 +275,46 @@ class Detection:
         table.meta = dict(self.provenance)
         return table
 
+    def limits(self, isochrone: Any = None, *, parallax: Any = None) -> QTable:
+        """Limits as they are published: separation, contrast, magnitudes and, with a model, masses.
+
+        Parameters
+        ----------
+        isochrone : QTable, Table or path, optional
+            An evolutionary model at the age of the star: a column mass (Jupiter masses, or with a
+            unit), and one that is named like the filter, such as F444W or JWST_NIRCam.F444W, with
+            absolute Vega magnitudes, AB magnitudes (unit mag(AB)), or flux densities at 10 pc.
+        parallax : float, Quantity or str, optional
+            Of the star, arcsec or such as "9.3 mas"; needed with `isochrone`.
+
+        Returns
+        -------
+        QTable
+            separation; contrast, the median of all angles in `contrast_curve`; dmag, its
+            magnitude; mag, the apparent Vega magnitude, where the flux density of the star is
+            known; and mass, from which every planet of the model is brighter than the limit, NaN
+            outside of it. Vega has the spectrum alpha_lyr_stis_011 of CALSPEC. Names have no
+            underscores, which LaTeX takes for subscripts.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a model without these columns or with several ages, without a parallax, or frames
+            that are not calibrated.
+        CorruptFileError, FileNotFoundError, UnitError
+            As their names say.
+
+        Examples
+        --------
+        A table for the CDS and one for LaTeX, by the writers of astropy:
+
+        >>> import pyklip_diffrender as dr
+        >>> table = dr.Detection.read("products").limits()  # doctest: +SKIP
+        >>> table.write("limits.txt", format="ascii.mrt")  # doctest: +SKIP
+        >>> table.write("limits.tex", format="ascii.aastex")  # doctest: +SKIP
+        """
+        return published_limits(self.contrast_curve, self, isochrone, parallax)
+
     @property
     def coordinates(self) -> SkyCoord:
         """Right ascension and declination of the candidates, in the order of the table.
@@ -356,13 +397,30 @@ class Detection:
         """Relative calibration errors of the candidates' contrasts and fluxes, (2, k)."""
         return candidate_errors(self.groups, self.sources, self.error_factor)
 
-    def measure(self, offsets: ArrayLike, *, sigmas: float = 5.0) -> QTable:
+    def measure(
+        self,
+        offsets: ArrayLike | None = None,
+        *,
+        separation: ArrayLike | None = None,
+        position_angle: ArrayLike | None = None,
+        sigmas: float = 5.0,
+    ) -> QTable:
         """Contrast of a point source at given positions, one at a time.
+
+        Positions are either `offsets`, or `separation` with `position_angle`, as in `candidates`;
+        all of them may be quantities.
 
         Parameters
         ----------
-        offsets : (k, 2)
-            x, y from the star, arcsec, image orientation of the first frame.
+        offsets : (k, 2), optional
+            x, y from the star, arcsec, image orientation of the first frame. Figures show offsets
+            to the east and to the north instead: take separation and position angle of a place that
+            is read off one.
+        separation : float or (k,), optional
+            From the star, arcsec.
+        position_angle : float or (k,), optional
+            Degrees east of north, or counter-clockwise from +y of the first frame, if its
+            orientation is not known.
         sigmas : float
             S/N of a detection, below which an upper limit is stated; 3 and 5 are usual.
 
@@ -377,11 +435,18 @@ class Detection:
         Raises
         ------
         IncompatibleSetupError
-            For a position outside the field, or if the detection was read from a file without its
-            fit; see `read`.
+            For a position outside the field, for positions that are given in both ways or in part,
+            or if the detection was read from a file without its fit; see `read`.
         NonFiniteError, ShapeError, UnitError
+
+        Examples
+        --------
+        >>> import pyklip_diffrender as dr
+        >>> found = dr.Detection.read("products")  # doctest: +SKIP
+        >>> found.measure(separation=0.6, position_angle=211)  # doctest: +SKIP
         """
-        raw, calibration = self._contrasts_at(offsets)
+        places = places_of(offsets, separation, position_angle, self.north)
+        raw, calibration = self._contrasts_at(places)
         return measured_table(raw, calibration, self.sky, sigmas)
 
     def _contrasts_at(self, offsets: ArrayLike) -> tuple[QTable, Image]:
@@ -452,8 +517,8 @@ class Detection:
     def plot(self, ax: Any = None) -> NDArray[Any]:
         """Draw the S/N map with the candidates, and the contrast curve.
 
-        The map is in arcsec from the star; arrows point to north and east where the position angle
-        of the first frame is known.
+        The map has north up and east left, in arcsec from the star, where the position angle of the
+        first frame is known; else it is that of the first frame, in x and y.
 
         Parameters
         ----------

@@ -22,12 +22,12 @@ from scipy.special import gamma, logsumexp
 
 from pyklip_diffrender.detection.field import (
     Image,
-    Positions,
     pixel_width,
     pixels_of,
     separation_of,
 )
 from pyklip_diffrender.detection.search_result import Detection
+from pyklip_diffrender.io.units import east_and_north
 from pyklip_diffrender.scene.admission import EPOCH
 
 _ORDER = 5
@@ -153,7 +153,7 @@ class SkyMap:
     @cached_property
     def _turn(self) -> NDArray[np.float64]:
         """Matrix from x, y to east, north, which is its own inverse: a reflection."""
-        return Positions(np.zeros((0, 2)), np.zeros((0, 2, 2)), self.north)._to_sky
+        return east_and_north(self.north)
 
     @cached_property
     def _splines(self) -> tuple[Image, ...]:

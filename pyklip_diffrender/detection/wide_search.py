@@ -28,8 +28,6 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance, 
 from pyklip_diffrender.detection.field import (
     Image,
     far_from,
-    pixel_width,
-    pixels_of,
     ring_pixels,
     separation_of,
 )
@@ -39,7 +37,6 @@ from pyklip_diffrender.detection.whole_frame import EDGE, REACH, WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
 from pyklip_diffrender.io.tables import add_columns
-from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.refinement import star_flux_error
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
@@ -158,29 +155,17 @@ class WideField:
         ndarray of Axes, (2,)
         """
         axes = drawing.axes_for(ax, 2)
-        grid, to_sky = self._sky_grid()
-        columns, rows = np.moveaxis(pixels_of(self.grid, grid @ to_sky), -1, 0)
-        snr = map_coordinates(self.snr, [rows, columns], order=1, cval=np.nan)
         table = self.candidates
         count = len(table)
         drawing.snr_map(
-            axes[0], snr, grid,
-            np.stack([table["x"].value, table["y"].value], axis=1) @ to_sky.T,
-            None if self.observation.position_angles is None else 0.0,
+            axes[0], self.snr, self.grid,
+            np.stack([table["x"].value, table["y"].value], axis=1),
+            self.observation.north,
             title=f"{count} candidate{'' if count == 1 else 's'} above S/N {self.threshold:g}",
             labels=[str(k) for k in range(1, count + 1)],
         )  # fmt: skip
         draw_curve(axes[1], self)
         return np.array(axes)
-
-    def _sky_grid(self) -> tuple[Image, Image]:
-        """x, y of pixels from the star with north up, (n, m, 2), and the rotation to them."""
-        to_sky = rotation_matrix(self.north)
-        edges = self.grid[[0, 0, -1, -1], [0, -1, 0, -1]] @ to_sky.T
-        step = pixel_width(self.grid)
-        low, high = np.floor(edges.min(axis=0) / step), np.ceil(edges.max(axis=0) / step)
-        x, y = (step * np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
-        return np.stack(np.meshgrid(x, y), axis=-1), to_sky
 
     def write(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> list[Path]:
         """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables.
@@ -211,7 +196,7 @@ class WideField:
         )
         write_fits(hdus, written[0])
         for path, table in tables.items():
-            write_table(table, path)
+            write_table(table, path, about.provenance)
         return written
 
 

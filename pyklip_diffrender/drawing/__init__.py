@@ -12,9 +12,9 @@ from pyklip_diffrender.drawing.curves import (
 )
 from pyklip_diffrender.drawing.figures import (
     axes_for,
-    compass,
     halo,
     new_figure,
+    on_sky,
     panel,
     save,
     to_png,
@@ -37,7 +37,6 @@ __all__ = [
     "Epoch",
     "Stamp",
     "axes_for",
-    "compass",
     "completeness",
     "contrast_curve",
     "corner",
@@ -45,6 +44,7 @@ __all__ = [
     "injected_planets",
     "light_norm",
     "new_figure",
+    "on_sky",
     "panel",
     "pupil_image",
     "save",

@@ -1,10 +1,9 @@
-"""Figures, their axes and writing them; the marks that they share: labels, circles, a compass."""
+"""Figures, their axes and writing them; the marks that they share: labels and circles."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from io import BytesIO
-from math import cos, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,13 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.units import east_and_north
 
 if TYPE_CHECKING:
     from astropy.units import UnitBase
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Marks on images: labels of axes, circles, a compass.
+# Marks on images: labels of axes, and circles.
 
 INK = "#1b1f24"
 ACCENT = "#0b6e4f"
@@ -27,9 +27,6 @@ ACCENT = "#0b6e4f"
 
 _LABELLED = 4
 """Largest number of circles with labels of more than two characters."""
-
-_COMPASS = 30.0
-"""From the tail of an arrow to its letter, points."""
 
 
 def halo() -> list[Any]:
@@ -39,11 +36,23 @@ def halo() -> list[Any]:
     return [withStroke(linewidth=3.5, foreground="white")]
 
 
-def label_sky(ax: Axes) -> None:
-    """Label axes whose origin is the star, and mark the star with a cross."""
-    ax.plot(0, 0, "+", color=INK, ms=11, mew=1.6, label="star", path_effects=halo())
-    ax.set_xlabel("x from the star (arcsec)")
-    ax.set_ylabel("y from the star (arcsec)")
+def on_sky(places: ArrayLike, north: float | None) -> NDArray[np.float64]:
+    """Turn x, y from the star (..., 2) into what axes show: offsets to the east and to the north.
+
+    `north` is the position angle of the image's +y axis, degrees east of north; x and y come back
+    as they are where it is None.
+    """
+    offsets = np.asarray(places, dtype=float)
+    return offsets if north is None else offsets @ east_and_north(north).T
+
+
+def label_sky(ax: Axes, oriented: bool, **style: Any) -> None:
+    """Label axes whose origin is the star: offsets to the east and north, or x and y."""
+    for label, name in (
+        (ax.set_xlabel, "ΔRA cos Dec (arcsec)" if oriented else "x from the star (arcsec)"),
+        (ax.set_ylabel, "ΔDec (arcsec)" if oriented else "y from the star (arcsec)"),
+    ):
+        label(name, **style)
 
 
 def circles(ax: Axes, places: ArrayLike, labels: Sequence[str] = ()) -> None:
@@ -58,27 +67,6 @@ def circles(ax: Axes, places: ArrayLike, labels: Sequence[str] = ()) -> None:
         ax.annotate(
             label, place, (0, 11), textcoords="offset points", color=INK, ha="center", va="bottom",
             path_effects=halo(),
-        )  # fmt: skip
-
-
-def compass(ax: Axes, position_angle: float) -> None:
-    """Draw arrows to north and east in the lower left corner.
-
-    `position_angle` is that of the image's +y axis, degrees east of north.
-    """
-    angle = radians(position_angle)
-    # Whichever way the arrows point, they stay inside.
-    north, east = (sin(angle), cos(angle)), (-cos(angle), sin(angle))
-    margin = 14.0
-    x, y = (margin - _COMPASS * min(0.0, north[k], east[k]) for k in range(2))
-    for letter, arrow in (("N", north), ("E", east)):
-        ax.annotate(
-            letter, (x, y), (x + _COMPASS * arrow[0], y + _COMPASS * arrow[1]),
-            xycoords="axes points", textcoords="axes points", color=INK, ha="center", va="center",
-            path_effects=halo(),
-            arrowprops={
-                "arrowstyle": "<-", "color": INK, "lw": 1.4, "shrinkB": 0, "path_effects": halo(),
-            },
         )  # fmt: skip
 
 

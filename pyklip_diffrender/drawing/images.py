@@ -1,19 +1,22 @@
 """Images on the sky, in arcsec from the star, and on the pupil, in metres.
 
-Every image is drawn with y up and a colour bar as high as it; NaN is grey. On the sky, `grid` has
-the x and y of the pixel centres, (ny, nx, 2), and `north` is the position angle of the image's +y
-axis, degrees east of north, or None where it is not known.
+Every image is drawn with a colour bar as high as it; NaN is grey. On the sky, `grid` has the x and
+y of the pixel centres, (ny, nx, 2), and `north` is the position angle of the image's +y axis,
+degrees east of north: the image is turned with its pixels, so that north is up and east left. Where
+`north` is None, because it is not known, y is up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pyklip_diffrender.drawing.figures import INK, circles, compass, label_sky
+from pyklip_diffrender.drawing.figures import INK, circles, halo, label_sky, on_sky
+from pyklip_diffrender.io.units import east_and_north
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +63,7 @@ def signed_image(
         limit = max(limit, linear)
         style = {"norm": AsinhNorm(linear, -limit, limit), "ticks": _ticks(linear, limit)}
     _on_sky(ax, image, grid, north, bar=bar, title=title, cmap=_SIGNED, **style)
-    circles(ax, places, labels)
+    circles(ax, on_sky(np.reshape(places, (-1, 2)), north), labels)
 
 
 def snr_map(
@@ -135,10 +138,9 @@ def _ticks(linear: float, limit: float) -> list[float]:
 
 
 def _on_sky(ax: Axes, image: Image, grid: Image, north: float | None, **style: Any) -> None:
-    show_pixels(ax, image, grid[0, :, 0], grid[:, 0, 1], **style)
-    label_sky(ax)
-    if north is not None:
-        compass(ax, north)
+    show_pixels(ax, image, grid[0, :, 0], grid[:, 0, 1], north=north, **style)
+    ax.plot(0, 0, "+", color=INK, ms=11, mew=1.6, label="star", path_effects=halo())
+    label_sky(ax, north is not None)
 
 
 def _on_pupil(ax: Axes, image: Image, width: float, **style: Any) -> None:
@@ -150,12 +152,23 @@ def _on_pupil(ax: Axes, image: Image, width: float, **style: Any) -> None:
 
 def show_pixels(
     ax: Axes, image: Image, x: Image, y: Image, *, bar: str, title: str,
-    ticks: Sequence[float] | None = None, **style: Any,
+    ticks: Sequence[float] | None = None, north: float | None = None, **style: Any,
 ) -> None:  # fmt: skip
-    """Draw an image whose pixels have their centres at `x` and `y`, with a colour bar."""
+    """Draw an image whose pixels have their centres at `x` and `y`, with a colour bar.
+
+    With `north`, the axes are offsets to the east and to the north, and the image is turned.
+    """
     half_x, half_y = (abs(axis[-1] - axis[0]) / (2 * max(len(axis) - 1, 1)) for axis in (x, y))
     extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
     artist = ax.imshow(image, origin="lower", extent=extent, interpolation="nearest", **style)
+    if north is not None:
+        from matplotlib.transforms import Affine2D
+
+        (a, c), (b, d) = east_and_north(north).tolist()
+        artist.set_transform(Affine2D.from_values(a, b, c, d, 0.0, 0.0) + ax.transData)
+        east, up = on_sky(list(product(extent[:2], extent[2:])), north).T
+        ax.set_xlim(east.max(), east.min())
+        ax.set_ylim(up.min(), up.max())
     ax.set_facecolor("0.75")
     ax.set_title(title, color=INK, loc="left")
     # An inset follows the image, whose box differs from that of the axes.

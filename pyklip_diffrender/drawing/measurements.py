@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyklip_diffrender.drawing.figures import ACCENT, INK, compass, halo
+from pyklip_diffrender.drawing.figures import ACCENT, INK, halo, label_sky, on_sky
 from pyklip_diffrender.drawing.images import show_pixels
 
 if TYPE_CHECKING:
@@ -59,17 +59,14 @@ def stamp_panels(stamp: Stamp, unit: str) -> Figure:
         (axes[1, 0], "Model", stamp.model, signed),
         (axes[1, 1], "Residual", residual, sigmas),
     ):
-        show_pixels(ax, image, stamp.x, stamp.y, title=title, **style)
+        show_pixels(ax, image, stamp.x, stamp.y, title=title, north=stamp.north, **style)
         ax.locator_params(nbins=3)
         for each in (ax, *ax.child_axes):
             each.tick_params(labelsize="small")
-        ax.plot(stamp.x.mean(), stamp.y.mean(), "+", color=INK, ms=8, path_effects=halo())
-    for ax in axes[1]:
-        ax.set_xlabel("x (arcsec)", fontsize="small")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("y (arcsec)", fontsize="small")
-    if stamp.north is not None:
-        compass(axes[1, 1], stamp.north)
+        middle = on_sky((stamp.x.mean(), stamp.y.mean()), stamp.north)
+        ax.plot(*middle, "+", color=INK, ms=8, path_effects=halo())
+        label_sky(ax, stamp.north is not None, fontsize="small")
+        ax.label_outer()
     return figure
 
 
@@ -162,7 +159,6 @@ def sky_track(ax: Axes, epochs: Sequence[Epoch], start: Array, title: str) -> No
     ax.set_ylim(start[1] - near, start[1] + near)
     ax.set_box_aspect(1.0)
     ax.locator_params(nbins=5)
-    ax.set_xlabel("offset to the east (arcsec)")
-    ax.set_ylabel("offset to the north (arcsec)")
+    label_sky(ax, oriented=True)
     ax.set_title(title, color=INK, loc="left")
     ax.legend(frameon=False, fontsize="small")

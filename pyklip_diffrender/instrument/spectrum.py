@@ -52,6 +52,17 @@ def _throughputs() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     return curves
 
 
+@lru_cache(maxsize=1)
+def _vega() -> dict[str, float]:
+    table = embedded_table("nircam_vega")
+    return dict(zip(map(str, table["filter"]), map(float, table["flux_density"]), strict=True))
+
+
+def vega_flux_density(filter: str | None) -> float | None:
+    """Flux density of Vega magnitude 0 in a filter, Jy; None if it is not known."""
+    return _vega().get((filter or "").upper())
+
+
 def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Wavelengths (m) and relative response (peak 1) of a filter, to be interpolated linearly.
 

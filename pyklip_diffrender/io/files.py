@@ -11,7 +11,7 @@ import secrets
 import shutil
 import warnings
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import resources
 from pathlib import Path
@@ -430,10 +430,15 @@ def sha256(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_table(table: Table, path: Path) -> None:
-    """Write a table as ECSV, whole or not at all; an existing file is replaced."""
+def write_table(table: Table, path: Path, facts: Mapping[str, Any] | None = None) -> None:
+    """Write a table as ECSV, whole or not at all, with `facts` among its metadata.
+
+    An existing file is replaced.
+    """
+    described = table.copy(copy_data=False)
+    described.meta = {**(facts or {}), **table.meta}
     with replacing(path) as temporary:
-        table.write(temporary, format="ascii.ecsv", overwrite=True)
+        described.write(temporary, format="ascii.ecsv", overwrite=True)
 
 
 def embedded_table(name: str) -> Table:

@@ -113,6 +113,8 @@ class ProgressBar:
             desc=self._name,
             disable=self._nested or not shown,
             leave=False,
+            # The time left by the mean of all steps: that of the last few jumps.
+            smoothing=0,
             bar_format=_OPEN if total is None else _COUNTED,
         )
 

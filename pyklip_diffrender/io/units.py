@@ -50,6 +50,15 @@ def rotation_matrix(degrees: float) -> NDArray[np.float64]:
     return np.array([[cosine, -sine], [sine, cosine]])
 
 
+def east_and_north(degrees: float) -> NDArray[np.float64]:
+    """Return the matrix (2, 2) from x, y of an image to offsets to the east and to the north.
+
+    `degrees` is the position angle of the image's +y axis, east of north. The matrix is a
+    reflection, because east is left of north.
+    """
+    return np.diag([-1.0, 1.0]) @ rotation_matrix(degrees)
+
+
 # Convert input to float64 arrays in SI units or arcsec, and check it.
 
 Bound = Literal["any", "not negative", "positive"]

@@ -24,7 +24,7 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
-from pyklip_diffrender.options import OPTIONS, ReduceOptions
+from pyklip_diffrender.options import OPTIONS, Accuracy, ReduceOptions
 from pyklip_diffrender.wavefront.opd import wavefront_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
@@ -63,8 +63,8 @@ class DiffrenderSettings:
         Arcsec per pixel. Read from the dataset if possible.
     fit_pixels : int, optional
         Side in pixels of the fitted square about the star; the subtraction covers the whole
-        frame. By default as large as the frames allow, up to
-        `pyklip_diffrender.pyklip_backend.subtract.FIT_PIXELS`.
+        frame. By default as large as the frames allow, up to 80, or up to 56 for a first look with
+        ``accuracy="quick"``.
     error : array_like, optional
         Standard deviation per pixel, in the unit of the frames: a number, (ny, nx), or
         (n, ny, nx) for the frames of ``dataset.input``. Read from the ERR extension if there is
@@ -138,6 +138,7 @@ class DiffrenderSettings:
     disk: bool | None = None
     star_flux: float | str | u.Quantity | None = None
     star_flux_error: float | None = None
+    accuracy: Accuracy | None = None
     image: Literal["cleaned", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None
@@ -177,6 +178,11 @@ class DiffrenderSettings:
                     f"{name}: got a {type(value).__name__}, expected a "
                     f"{'dict' if kind is Mapping else kind.__name__}"
                 )
+        if self.fit is not None and self.accuracy == "quick":
+            raise IncompatibleSetupError(
+                "accuracy, fit: got 'quick' and settings of the fit, expected one of them: a first "
+                "look chooses its own settings"
+            )
         known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
         wrong = sorted(set(self.model_options) - known)
         # Another subtractor may make another model.
@@ -210,7 +216,15 @@ DiffrenderSettings.__doc__ = inspect.cleandoc(DiffrenderSettings.__doc__ or "").
     "(see the options)",
     "\n".join(
         OPTIONS[name].entry
-        for name in ("start", "references", "threshold", "disk", "star_flux", "star_flux_error")
+        for name in (
+            "start",
+            "references",
+            "threshold",
+            "disk",
+            "star_flux",
+            "star_flux_error",
+            "accuracy",
+        )
     ),
 )
 

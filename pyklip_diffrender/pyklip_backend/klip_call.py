@@ -31,7 +31,7 @@ from pyklip_diffrender.errors import (
     RefinementError,
     ShapeError,
 )
-from pyklip_diffrender.io.headers import fits_text, set_keyword
+from pyklip_diffrender.io.headers import fits_text, fits_unit, set_keyword
 from pyklip_diffrender.pyklip_backend.backend_settings import (
     DiffrenderSettings,
     starting_opd,
@@ -357,7 +357,9 @@ class DatasetReduction:
                 reduce(**{**self.arguments, "outputdir": str(stage), "fileprefix": prefix})
                 cards = provenance(self.records)
                 self._write_extras(stage, prefix, cards)
-                stamp(stage, cards)
+                calibrated = bool(self.arguments["calibrate_flux"])
+                unit = self.records[0].frames.observation.unit
+                stamp(stage, cards, "" if calibrated else fits_unit(unit))
         except BaseException as error:
             vars(self.dataset).clear()
             vars(self.dataset).update(before)

@@ -382,6 +382,11 @@ def staging(folder: Path) -> Iterator[Path]:
             shutil.rmtree(stage)
 
 
+_PARAMETERS = "subsect, minmove, numbasis, minrot: not used"
+_SLICES = "as asked for; all slices are one image"
+"""Comments on cards of KLIP's parameters and modes."""
+
+
 def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
     """Cards for a product made from these wavelengths: keywords, then HISTORY.
 
@@ -422,7 +427,8 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         set_keyword(header, key, value)
     header.add_history(
         f"Star rendered and subtracted by pyklip_diffrender {__version__}; the "
-        "KL modes are all the same image"
+        "KL modes are all the same image; subsections, movement, numbasis, minrot and the number "
+        "of annuli are not used"
     )
     header.add_history("DRSHA256 is the SHA-256 of the wavefront map's file, or of its array")
     for record in records:
@@ -464,11 +470,21 @@ def _fitted(subtraction: Subtraction) -> Iterator[str]:
         )
 
 
-def stamp(folder: Path, cards: fits.Header) -> None:
-    """Add cards to the primary header of every FITS file in a folder; pixels stay as they are."""
+def stamp(folder: Path, cards: fits.Header, unit: str) -> None:
+    """Add cards to the primary header of every FITS file in a folder; pixels stay as they are.
+
+    `unit` is that of files without BUNIT; empty if it is not known. The cards of KLIP's parameters
+    stay, because programs read them, with a comment that says what they mean here.
+    """
     for path in (p for p in folder.rglob("*") if ".fits" in p.suffixes):
         with fits.open(path, mode="update", memmap=False) as hdus:
-            hdus[0].header.extend(cards, strip=False, update=True)
+            header = hdus[0].header
+            header.extend(cards, strip=False, update=True)
+            if unit and "BUNIT" not in header:
+                header["BUNIT"] = unit
+            for key in header:
+                if key == "PSFPARAM" or key.startswith("KLMODE"):
+                    header.comments[key] = _PARAMETERS if key == "PSFPARAM" else _SLICES
 
 
 def _shared(values: Iterable[str]) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.progress import heard_by
-from pyklip_diffrender.options import ReduceOptions
+from pyklip_diffrender.options import QUICK_SIDE, ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.fitted_star import (
     Fit,
@@ -53,17 +53,17 @@ def subtract_by_refinement(
     `observation`; `tell` gets a line of text at every stage. Raises RefinementError for an
     implausible fit, and warns of one that has not converged.
     """
-    model = model_of(observation, settings)
-    # Takes a second to import, so only after the input has been checked.
-    from pyklip_diffrender.reduction import prepare
-    from pyklip_diffrender.reduction.fit_status import warn_of_status
-
     # Frames with the same star centre and position angle, such as the integrations of one exposure,
     # are averaged; all rolls and dithers share a wavefront. The fit uses a square about the star,
     # the subtraction covers all valid pixels.
     groups = list(pointings_of(observation) if pointings is None else pointings)
     # Averaged before they are cut, as the means of files are, so that the weights are the same.
     science = tuple(group.observation.combined() for group in groups)
+    model = model_of(observation, settings, science[0])
+    # Takes a second to import, so only after the input has been checked.
+    from pyklip_diffrender.reduction import prepare
+    from pyklip_diffrender.reduction.fit_status import warn_of_status
+
     sequence = FrameSequence(observation.target, science, tuple(references))
     options = _options(settings, observation, references)
     preparation = prepare(sequence, opd, options, model=model)
@@ -180,8 +180,13 @@ def _described(result: Refinement) -> str:
     return f"{result.status.name}, chi2 per pixel {result.chi2_per_pixel:.3g}"
 
 
-def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:
-    """The model from the settings, else one made for the observation's filter."""
+def model_of(
+    observation: Observation, settings: DiffrenderSettings, first: Observation
+) -> OpticalSystem:
+    """The model from the settings, else one made for the observation's filter.
+
+    For a first look it is coarse, by the noise of the frame `first`.
+    """
     if settings.model is not None:
         return cast("OpticalSystem", settings.model)
     if observation.filter is None:
@@ -193,5 +198,12 @@ def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalS
     options = dict(settings.model_options)
     if settings.pixelscale is not None:
         options = {"pixelscale": observation.pixelscale, **options}
-    size = settings.fit_pixels or min(FIT_PIXELS, *Window.holding(observation.valid).shape)
+    is_quick = settings.accuracy == "quick"
+    most = QUICK_SIDE if is_quick else FIT_PIXELS
+    size = settings.fit_pixels or min(most, *Window.holding(observation.valid).shape)
+    if is_quick:
+        # Takes a second to import.
+        from pyklip_diffrender.refinement import coarse_arguments
+
+        options = {**coarse_arguments(first, (size, size)), **options}
     return model_for(observation, size, **options)

@@ -27,8 +27,23 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _SENTENCE_AT = 1.5
 """Separation, arcsec, near which the first sentence states the limit."""
 
+_RECENT_DAYS = 7.0
+"""Days from the frames to a wavefront map up to which it passes without a remark: maps are made
+every two days, and one of a week before is rarely the nearest."""
+
 _TINY = 1e-9
 """Probabilities below this rest on tails that no noise is known to follow."""
+
+
+def remark_on_map(days: float | None) -> str:
+    """Remark on a wavefront map so many days from the frames; empty for one of the same week."""
+    if days is None or abs(days) <= _RECENT_DAYS:
+        return ""
+    return (
+        f"The wavefront map was sensed {abs(days):.0f} days "
+        f"{'before' if days > 0 else 'after'} the frames. JWST's is sensed every two days or so: a "
+        "map nearer in time is a better start."
+    )
 
 
 def sentence(summary: Mapping[str, Any]) -> str:

@@ -215,7 +215,8 @@ class Overview:
         )  # fmt: skip
         pixel = self.images.grid[0, 1, 0] - self.images.grid[0, 0, 0]
         half = np.abs(self.images.grid).max() + pixel / 2
-        ax.set_xlim(-half, half)
+        # East is left.
+        ax.set_xlim((-half, half) if north is None else (half, -half))
         ax.set_ylim(-half, half)
 
     def kept(self, separations: Sequence[float]) -> tuple[Image, Image | None]:
@@ -471,22 +472,18 @@ def _measured(
 
     The offset is that to the east and north where the orientation is known, else x and y.
     """
-    row, sources = detection.candidates[place], detection.sources
-    index, count = _source_of(detection, place), len(sources)
-    at = index + count * np.arange(3)
-    factor = detection.error_factor.of(sources.offsets[index : index + 1])[0]
-    covariance = factor**2 * sources.covariance.numpy()[np.ix_(at, at)]
-    # That of the star's flux, which does not depend on the position.
-    covariance[0, 0] = row["contrast_error"] ** 2
-    x, y = row["x"].value, row["y"].value
-    if "delta_ra" not in row.colnames:
-        return ("x", "y"), np.array([row["contrast"], x, y]), covariance
-    angle = np.deg2rad(detection.north)
-    sine, cosine = np.sin(angle), np.cos(angle)
-    # East is -x cos n + y sin n, north x sin n + y cos n; see docs/conventions.md.
-    turn = np.eye(3)
-    turn[1:, 1:] = [[-cosine, sine], [sine, cosine]]
-    return ("ΔRA cos Dec", "ΔDec"), turn @ [row["contrast"], x, y], turn @ covariance @ turn.T
+    row = detection.candidates[place]
+    is_known = "delta_ra" in row.colnames
+    offset = ("delta_ra", "delta_dec") if is_known else ("x", "y")
+    short = ("ra", "dec") if is_known else ("x", "y")
+    values = np.array([row["contrast"], *(row[each].value for each in offset)])
+    errors = np.array([row["contrast_error"], *(row[f"{each}_error"].value for each in offset)])
+    upper = np.zeros((3, 3))
+    upper[np.triu_indices(3, 1)] = [
+        *(row[f"contrast_{each}_corr"] for each in short), row[f"{''.join(short)}_corr"]
+    ]  # fmt: skip
+    covariance = np.outer(errors, errors) * (np.eye(3) + upper + upper.T)
+    return (("ΔRA cos Dec", "ΔDec") if is_known else offset), values, covariance
 
 
 def _scaled(detection: Detection) -> str:

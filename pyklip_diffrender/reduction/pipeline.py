@@ -46,6 +46,7 @@ from pyklip_diffrender.pattern import (
 )
 from pyklip_diffrender.reduction.extended_light import looks_extended, on_extended_light
 from pyklip_diffrender.reduction.fit_status import require_plausible
+from pyklip_diffrender.reduction.pages import remark_on_map
 from pyklip_diffrender.reduction.visit import (
     Contribution,
     Joined,
@@ -71,7 +72,7 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import OF_ANOTHER_EPOCH, Sequence
 from pyklip_diffrender.scene.simulation import model_for, within_field
 from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
-from pyklip_diffrender.wavefront.opd import wavefront_for
+from pyklip_diffrender.wavefront.opd import OUTDATED_DAYS, wavefront_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # The result of a reduction.
@@ -151,11 +152,15 @@ class ReductionResult:
 
     def __str__(self) -> str:
         known = "none" if self.systematics is None else f"from {self.systematics.name}"
-        search = self.detection if self.wide is None else self.wide
         return (
             f"{self.sequence!r}\n{self._status}\n"
-            f"flat-field pattern: {known}\n{self._references}{search}\n{self.remark}"
+            f"flat-field pattern: {known}\n{self._references}{self.search}\n{self.remark}"
         ).rstrip()
+
+    @property
+    def search(self) -> Detection | WideField:
+        """The search of the whole frames, if it was asked for, else that of the fitted pixels."""
+        return self.detection if self.wide is None else self.wide
 
     @property
     def _references(self) -> str:
@@ -203,6 +208,10 @@ def prepare(
     """
     wavefront = wavefront_for(opd, sequence.date)
     is_folder = isinstance(opd, str | os.PathLike) and Path(opd).is_dir()
+    days = None if sequence.date is None else wavefront.days_after(sequence.date)
+    # An older one has been warned of.
+    if days is not None and abs(days) <= OUTDATED_DAYS and (remark := remark_on_map(-days)):
+        _log.warning("%s", remark)
 
     def map_for(date: Time | None) -> OPDMap:
         """Of a folder of maps, the one nearest to a date."""
@@ -219,15 +228,15 @@ def prepare(
     sequence = _within_field(sequence)
     if options.wide:
         require_outer_pixels(sequence.science[0], options.side)
-    first, settings, coarser = sequence.science[0], options.settings, {}
-    if options.accuracy == "quick":
-        settings = quick_settings(first.cutout(options.side))
-        coarser = coarse_arguments(first, (options.side, options.side))
+    first, is_quick = sequence.science[0], options.accuracy == "quick"
     if model is None:
+        shape = (options.side, options.side)
+        coarser = coarse_arguments(first, shape) if is_quick else {}
         model = model_for(first, options.side, device=options.device, **coarser)
         cut = sequence.cutout(options.side)
     else:
         cut = sequence.cutout(model.detector.shape, beyond_edges=True)
+    settings = quick_settings(cut.science[0]) if is_quick else options.settings
     science, references = (
         tuple(map(without_blurred_edges, wholes, cuts))
         for wholes, cuts in (

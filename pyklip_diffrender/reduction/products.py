@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import OutputFolder, replacing, write_table
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.io.files import OutputFolder, read_text, replacing, write_table
 from pyklip_diffrender.reduction.pages import (
     FIGURE_FORMATS,
     count,
     depth_against_klip,
     number,
     plus_minus,
+    remark_on_map,
     render,
     scientific,
     write_figures,
@@ -27,11 +28,13 @@ from pyklip_diffrender.reduction.pages import (
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import summarise
+from pyklip_diffrender.scene.sequence import by_reason
 
 # The report: what its page shows of a summary, and its pictures.
 
 _PHOTOMETRY = (
-    "Flux densities and magnitudes (AB) are those of the source without coronagraph: the "
+    "Flux densities and magnitudes (AB; Vega by CALSPEC's alpha_lyr_stis_011) are those of the "
+    "source without coronagraph: the "
     "transmission of mask and Lyot stop is accounted for. Their errors do not include that of the "
     "pipeline's photometric calibration behind the coronagraph, about 30 % (0.3 mag)."
 )
@@ -59,6 +62,8 @@ def page(
         outside=0 if wide is None else len(wide["candidates"]) - len(summary["candidates"]),
         deeper=depth_against_klip(summary["contrast_curve"], summary["klip_curve"]),
         age=_age(summary["wavefront_map"]["days_before_first_frame"]),
+        map_remark=remark_on_map(summary["wavefront_map"]["days_before_first_frame"]),
+        left_out=by_reason((each["name"], each["reason"]) for each in summary["left_out"]),
         provenance=_provenance(summary),
         settings=list(_flat(summary["settings"])),
     )
@@ -84,6 +89,7 @@ _SKY = (
     _Column("Correlation of the two", "{:.2f}".format, "radec_corr"),
     _Column("Flux density (Jy)", scientific, "flux_density_Jy", "flux_density_error_Jy"),
     _Column("AB magnitude", plus_minus, "ab_mag", "ab_mag_error"),
+    _Column("Vega magnitude", plus_minus, "vega_mag", "vega_mag_error"),
 )
 
 
@@ -117,7 +123,7 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         source = "as stated" if star["source"] == "star_flux" else "from its diffracted light"
         flux = [("Flux density of the star", f"{value} Jy, {source}")]
     return [
-        ("Reduced chi-squared without model error", number(fit["reduced_chi2"])),
+        ("Reduced chi-squared without model error", _chi2(fit["reduced_chi2"])),
         (
             "Error of the star model",
             "none needed" if error == 0 else number(error and 100 * error, ".2g", "% of the star"),
@@ -127,6 +133,16 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Flat-field pattern", _pattern(summary["systematics"])),
         *flux,
     ]
+
+
+def _chi2(value: float | None) -> str:
+    """Reduced chi-squared, and what it means where it is below 1."""
+    if value is None or value >= _SMALL_CHI2:
+        return number(value)
+    return (
+        f"{number(value)}; below 1 because the errors of the frames are larger than their noise, "
+        "as in resampled frames. They are not made smaller"
+    )
 
 
 def _pattern(used: Mapping[str, Any] | None) -> str:
@@ -187,6 +203,11 @@ def _setting(value: Any) -> str:
     return ", ".join(_setting(each) for each in value) or "none"
 
 
+_SMALL_CHI2 = 0.9
+"""Reduced chi-squared below which errors are larger than the noise: of 1,600 pixels, which is the
+smallest number that is fitted as a rule, it has a standard deviation of 0.035."""
+
+
 # The files that a reduction writes.
 
 PRODUCTS = {
@@ -222,6 +243,19 @@ _FIGURE = re.compile(
     rf"\.({'|'.join(FIGURE_FORMATS)})"
 )
 """Names of the files of figures."""
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Read ``summary.json`` of a folder; CorruptFileError if it is missing or damaged."""
+    path = folder / "summary.json"
+    try:
+        content: dict[str, Any] = json.loads(read_text(path))
+        return content
+    except (OSError, ValueError) as error:
+        raise CorruptFileError(
+            f"{path}: not the summary of a reduction ({error}). Expected a folder that "
+            "Reduction.write wrote"
+        ) from error
 
 
 def existing_products(folder: Path) -> list[Path]:
@@ -270,7 +304,7 @@ def write_products(
     for name, table in tables.items():
         if table is not None:
             written.append(folder / f"{name}.ecsv")
-            write_table(table, written[-1])
+            write_table(table, written[-1], reduction.detection.provenance)
     overview = Overview(SkyImages(reduction), Klip.of(reduction))
     written.append(overview.images.write(folder / "images.fits"))
     written.append(folder / "detection.png")

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 import os
+import textwrap
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Unpack
 
+from astropy.table import QTable
+from numpy.typing import NDArray
+
+from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.detection.published_limits import published_limits
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.options import ReduceKeywords, ReduceOptions
 from pyklip_diffrender.reduction.pipeline import ReductionResult, prepare
-from pyklip_diffrender.reduction.products import ProductFolder
+from pyklip_diffrender.reduction.products import ProductFolder, read_summary
+from pyklip_diffrender.reduction.summary import summarise
+from pyklip_diffrender.reduction.visit import Visit
+from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.sequence import Sequence
 
 
@@ -53,9 +65,129 @@ class Reduction(ReductionResult):
 
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
-    >>> print(result.detection.candidates["separation", "contrast", "snr"])  # doctest: +SKIP
+    >>> print(result.candidates["separation", "contrast", "snr"])  # doctest: +SKIP
     >>> result.write("products")  # doctest: +SKIP
     """
+
+    def __str__(self) -> str:
+        return f"{textwrap.fill(self.sentence, 80)}\n{super().__str__()}"
+
+    @cached_property
+    def sentence(self) -> str:
+        """The result in a few sentences, with which the report begins."""
+        return str(summarise(self)["sentence"])
+
+    @property
+    def candidates(self) -> QTable:
+        """Table of the candidates, of the whole frames where they were searched.
+
+        See `Detection.candidates` and `WideField`.
+        """
+        return self.search.candidates
+
+    @property
+    def contrast_curve(self) -> QTable:
+        """Limits by separation, to the edge of the whole frames where they were searched."""
+        return self.search.contrast_curve
+
+    def limits(self, isochrone: Any = None, *, parallax: Any = None) -> QTable:
+        """Limits as they are published, see `Detection.limits`; of `contrast_curve`."""
+        return published_limits(self.contrast_curve, self.detection, isochrone, parallax)
+
+    def plot(self, ax: Any = None) -> NDArray[Any]:
+        """Draw the S/N map with the candidates, and the contrast curve.
+
+        North is up, and east left, where the orientation of the first frame is known.
+
+        Parameters
+        ----------
+        ax : two Axes, optional
+            Default those of a new figure.
+
+        Returns
+        -------
+        ndarray of Axes, (2,)
+        """
+        return self.search.plot(ax)
+
+    @classmethod
+    def read(cls, folder: str | os.PathLike[str]) -> Reduction:
+        """Read the products that `write` wrote.
+
+        Frames are as they were fitted. Not read, because no product has them, are the fits of
+        reference stars, frames of reference stars that were not fitted with the target's, and the
+        table of all files. The search of whole frames and a disk are None, with a warning; their
+        files are for other programs. The derivatives of the images, which `measure` and another
+        `write` need, are there if they were written.
+
+        Parameters
+        ----------
+        folder : path
+
+        Returns
+        -------
+        Reduction
+
+        Raises
+        ------
+        CorruptFileError
+            If detection.fits, fit.fits or summary.json is missing or damaged. A folder without
+            fit.fits may have a detection that ``Detection.read`` reads.
+        IncompatibleSetupError
+            If the fit is not the one that was searched.
+
+        Warns
+        -----
+        DiffrenderWarning
+            If the folder has products of whole frames or a disk, which are not read.
+
+        Examples
+        --------
+        With a folder of products, which the package does not contain:
+
+        >>> import pyklip_diffrender as dr
+        >>> print(dr.Reduction.read("products").candidates)  # doctest: +SKIP
+        """
+        folder = Path(folder)
+        fit = Refinement.read(folder / "fit.fits")
+        detection = Detection.read(folder, fit=None if fit.stored_linear is None else fit)
+        frames = [each.observation for each in fit.frames]
+        about = read_summary(folder)
+        left = [(each["name"], each["reason"]) for each in about["left_out"]]
+        star = "reference star "
+        unread = [name for name in ("wide_field.fits", "disk.fits") if (folder / name).exists()]
+        if unread:
+            warnings.warn(
+                f"{folder}: {' and '.join(unread)} "
+                f"{'is' if len(unread) == 1 else 'are'} not read: the reduction is that of the "
+                "pixels in which the star was fitted",
+                DiffrenderWarning,
+                stacklevel=2,
+            )
+        tables = {
+            name: QTable.read(folder / f"{name}.ecsv")
+            for name in ("injections", "completeness")
+            if (folder / f"{name}.ecsv").exists()
+        }
+        result = cls(
+            Sequence(
+                about["target"],
+                tuple(each for each in frames if not each.reference),
+                tuple(each for each in frames if each.reference),
+                tuple(each for each in left if not each[0].startswith(star)),
+            ),
+            fit,
+            detection,
+            systematics=fit.systematics,
+            failed=tuple((n.removeprefix(star), why) for n, why in left if n.startswith(star)),
+            pattern=about["pattern"],
+            visit=Visit.from_facts(about["visit"]),
+            accuracy=about["accuracy"],
+            **tables,
+        )
+        # The fit does not say how sources of a disk were arranged.
+        vars(result).update(sentence=about["sentence"], extended=about["extended"])
+        return result
 
     def write(
         self,
@@ -91,8 +223,14 @@ class Reduction(ReductionResult):
         ExistingFileError
             If there are products in the folder, and `overwrite` is False; it is also an `OSError`.
         IncompatibleSetupError
-            For another format of figures.
+            For another format of figures, and for a reduction that was read without derivatives.
         """
+        if not self.detection.groups:
+            raise IncompatibleSetupError(
+                f"{self.sequence.target}: the reduction was read from a folder without the "
+                "derivatives of the images, which its figures need. Copy that folder, or write the "
+                "reduction with derivatives=True first"
+            )
         products = ProductFolder(
             folder, derivatives=derivatives, figures=figures, overwrite=overwrite
         )

@@ -60,7 +60,11 @@ def write_comparison(
             "comparison.html",
             target=target,
             folders=folders,
-            thumbnails=_thumbnails(folders, Path(folder)),
+            shown=[
+                *_thumbnails(folders, Path(folder)),
+                *([] if isinstance(combination, str) else [_combined_map(combination)]),
+                *_limits(folders, combination),
+            ],
             tracks=[] if isinstance(combination, str) else _tracks(combination),
             combined=combined,
             combined_table=None if "reason" in combined else combined_rows(combined),
@@ -107,6 +111,66 @@ def _thumbnails(folders: Mapping[str, Mapping[str, Any]], above: Path) -> list[P
             )
         )
     return pictures
+
+
+def _combined_map(combination: Combination) -> Picture:
+    """S/N of all reductions together, with one spectrum."""
+    table, spectrum = combination.candidates, _shown_spectrum(combination)
+    image = combination.snr[combination.spectra.names.index(spectrum)]
+    figure, ax = drawing.panel()
+    # East is to the left.
+    drawing.snr_map(
+        ax, image, combination.grid * (-1, 1),
+        _columns(table, "delta_ra", "delta_dec") * (-1, 1), 0.0, title="All together",
+        labels=[str(k + 1) for k in range(len(table))],
+    )  # fmt: skip
+    return Picture(
+        "combined",
+        figure,
+        f"All reductions together: S/N of a point source that does not move, with the spectrum "
+        f"{spectrum}, numbered as in the table of the combined search.",
+    )
+
+
+def _shown_spectrum(combination: Combination) -> str:
+    """Spectrum of the most significant candidate, if it is a listed one, else the last listed."""
+    names = combination.spectra.names
+    best = "".join(map(str, combination.candidates["spectrum"][:1]))
+    return best if best in names else names[-1]
+
+
+def _limits(
+    folders: Mapping[str, Mapping[str, Any]], combination: Combination | str
+) -> list[Picture]:
+    """Contrast curves of the reductions, and the limits of all together; none without any."""
+    curves = [
+        (_name(each), *_known(curve["separation_arcsec"], curve["contrast"]))
+        for each in folders.values()
+        if (curve := each["contrast_curve"])["contrast"]
+    ]
+    if not curves:
+        return []
+    sigmas = next(iter(folders.values()))["contrast_curve"]["sigmas"]
+    about = (
+        f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}, against "
+        "separation: the median of all position angles."
+    )
+    if not isinstance(combination, str):
+        name = _shown_spectrum(combination)
+        table = combination.limits[combination.limits["spectrum"] == name]
+        if len(table):
+            contrast = np.asarray(table["contrast"]) * sigmas / table.meta["sigmas"]
+            label = f"all together, in {table['filter'][0]}"
+            curves.append((label, *_known(table["separation"].value, contrast)))
+            about = f"{about} All together: of a planet with the spectrum {name}."
+    figure, ax = drawing.panel()
+    drawing.survey_limits(ax, curves, [], sigmas)
+    return [Picture("limits", figure, about)]
+
+
+def _known(separation: Any, contrast: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A curve as arrays, with NaN for what is not known."""
+    return np.array(separation, dtype=float), np.array(contrast, dtype=float)
 
 
 def _offset(candidate: Mapping[str, Any]) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.io.headers import known_number, known_text
 from pyklip_diffrender.io.tables import labelled, plain_rows
+from pyklip_diffrender.io.units import east_and_north
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction.fit_status import advice
@@ -82,6 +83,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
         },
         "wavefront_map": _wavefront_map(fit, first),
         "systematics": _systematics(reduction),
+        "pattern": reduction.pattern,
         "extended": reduction.extended,
         "candidates": _candidates(reduction),
         "wide_field": None if reduction.wide is None else _wide_field(reduction.wide),
@@ -262,7 +264,7 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
             for name in ("contrast", "lowest", "highest", "known_star", "small_sample")
         }
         star = detection.sky.star_jansky
-        known = {} if star is None else _photometry(star * values["contrast"])
+        known = {} if star is None else _photometry(star * values["contrast"], detection.sky.vega)
         rows.append(
             {
                 "separation_arcsec": float(separation_arcsec),
@@ -274,8 +276,10 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
     return rows
 
 
-def _photometry(jansky: float) -> dict[str, float]:
-    return {"flux_density_Jy": jansky, "ab_mag": (jansky * u.Jy).to_value(u.ABmag)}
+def _photometry(jansky: float, vega: float | None) -> dict[str, float]:
+    """Flux density with AB and Vega magnitude; `vega` is the flux density of magnitude 0, Jy."""
+    known = {"flux_density_Jy": jansky, "ab_mag": (jansky * u.Jy).to_value(u.ABmag)}
+    return known if vega is None else known | {"vega_mag": -2.5 * math.log10(jansky / vega)}
 
 
 def _frame(observation: Observation, use: str) -> dict[str, Any]:
@@ -300,9 +304,15 @@ def _exposure(frames: Sequence[Observation]) -> float | None:
 
 
 def _bad_pixels(observation: Observation, fitted: FrameFit) -> list[list[float]]:
-    """x, y from the star, arcsec, of good pixels of the file that the fit has left out."""
+    """Good pixels of the file that the fit has left out, in arcsec from the star.
+
+    Offsets to the east and to the north, or x and y where the orientation is not known.
+    """
     left_out = observation.valid.any(axis=0) & ~fitted.observation.valid.any(axis=0)
-    return [[round(float(v), 3) for v in place] for place in fitted.grid[left_out]]
+    places = fitted.grid[left_out]
+    if observation.north is not None:
+        places = places @ east_and_north(observation.north).T
+    return [[round(float(v), 3) for v in place] for place in places]
 
 
 def _settings(settings: Any) -> dict[str, Any]:

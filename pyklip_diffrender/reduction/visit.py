@@ -22,9 +22,9 @@ import itertools
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -155,6 +155,20 @@ class Visit:
 
     def __repr__(self) -> str:
         return f"<Visit: {self.in_words()}>"
+
+    @classmethod
+    def from_facts(cls, facts: Mapping[str, Any]) -> Visit:
+        """Of the entry of ``summary.json``, in which None stands for NaN."""
+
+        def known(entries: Mapping[str, Any]) -> dict[str, Any]:
+            return {key: math.nan if value is None else value for key, value in entries.items()}
+
+        contributions = []
+        for each in facts["contributions"]:
+            # KLIP is not a use by the fit.
+            use = "not used" if each["use"] == "KLIP only" else each["use"]
+            contributions.append(Contribution(**known({**each, "use": use})))
+        return cls(tuple(contributions), known(facts)["gain"])
 
     @property
     def unused(self) -> tuple[Contribution, ...]:

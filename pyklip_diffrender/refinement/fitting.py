@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -319,9 +320,7 @@ def refine(
             f"model: got a {type(model).__name__}, expected an OpticalSystem. The order of the "
             "arguments is refine(model, observation, opd)"
         )
-    observations = [observation] if isinstance(observation, Observation) else list(observation)
-    if not observations:
-        raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
+    observations = _listed(observation)
     require_agreement(observations)
     adapted = settings_for(observations[0]) if settings is None else settings
     if not isinstance(adapted, GaussNewton):
@@ -345,6 +344,26 @@ def refine(
     ]
     with breakdown_explained(observations[0].name):
         return fit_in_stages(problems, adapted, progress=progress)
+
+
+def _listed(observation: Any) -> list[Observation]:
+    """One observation or several as a list; raises for anything else, and for none."""
+    if isinstance(observation, Observation):
+        return [observation]
+    # A text has members, too.
+    is_path = isinstance(observation, str | os.PathLike)
+    listed = list(observation) if isinstance(observation, Iterable) and not is_path else []
+    wrong = next((each for each in listed if not isinstance(each, Observation)), None)
+    if is_path or wrong is not None or not isinstance(observation, Iterable):
+        got = observation if wrong is None else wrong
+        what = repr(os.fspath(got)) if isinstance(got, str | os.PathLike) else type(got).__name__
+        raise IncompatibleSetupError(
+            f"observation: got {what}, expected an Observation or several, such as the "
+            "attribute science of Sequence.from_files(files).cutout(size)"
+        )
+    if not listed:
+        raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
+    return listed
 
 
 def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start]:

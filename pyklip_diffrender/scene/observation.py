@@ -660,7 +660,7 @@ class Observation:
     def plot(self, ax: Any = None, *, frame: int = 0) -> Any:
         """Draw a frame, in arcsec from the star; masked pixels are grey.
 
-        Arrows point to north and east where the position angle is known.
+        North is up and east left where the position angle is known.
 
         Parameters
         ----------

@@ -166,6 +166,10 @@ class Sequence:
             f"target, {len(self.references)} of reference stars>"
         )
 
+    def __len__(self) -> int:
+        """Number of frames of the target and of reference stars."""
+        return len(self.science) + len(self.references)
+
     @property
     def filter(self) -> str | None:
         """Filter of the target's frames."""
@@ -605,6 +609,17 @@ def _rows(
 def _is_near(date: Time | None, dates: list[Time]) -> bool:
     """Whether a frame was taken in the epoch of these dates, as far as is known."""
     return date is None or not dates or min(abs(date.mjd - each.mjd) for each in dates) <= EPOCH
+
+
+def by_reason(excluded: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Names of files that were left out for one reason, in a few words, with the reason."""
+    names: dict[str, list[str]] = {}
+    for name, reason in excluded:
+        names.setdefault(reason, []).append(name)
+    return [
+        (f"{len(of)} files, {of[0]} to {of[-1]}" if len(of) > 2 else ", ".join(of), reason)
+        for reason, of in names.items()
+    ]
 
 
 def _days(sequences: Iterable[Sequence]) -> str:

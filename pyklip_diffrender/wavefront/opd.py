@@ -296,7 +296,7 @@ Rule = Literal["nearest", "before", "after", "interpolate"]
 
 RULES: tuple[Rule, ...] = ("nearest", "before", "after", "interpolate")
 
-_OUTDATED = 200.0
+OUTDATED_DAYS = 200.0
 """Days between a map and the frames above which a warning is given: the telescope is realigned
 every few weeks to months, so that such a map is of another state of the mirror."""
 
@@ -488,7 +488,7 @@ def _interpolated(before: OPDMap, after: OPDMap, when: Time) -> OPDMap:
 
 def _warn_if_outdated(opd: OPDMap, when: Time) -> None:
     days = opd.days_after(when)
-    if days is not None and abs(days) > _OUTDATED:
+    if days is not None and abs(days) > OUTDATED_DAYS:
         warnings.warn(
             f"{opd.name}: the wavefront was sensed {abs(days):.0f} days "
             f"{'after' if days > 0 else 'before'} the frames of {when.isot[:10]}. The telescope "
