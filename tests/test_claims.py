@@ -143,7 +143,7 @@ BOTH = ("F444W", "F356W")
 LIMITS, IMAGES, DISKS = "real_pairs_limits", "real_pairs_images", "disk_limits"
 README, PAPER, PAGE = "README.md", "paper/paper.md", "docs/validation/real_frames.md"
 HOWTO, RESOURCES = "docs/howto/real_frames.md", "docs/howto/resources.md"
-NEIGHBOURS = "docs/validation/neighbours.md"
+NEIGHBOURS, SPACEKLIP = "docs/validation/neighbours.md", "docs/howto/spaceklip.md"
 CALIBRATION, DEMO = "docs/validation/calibration.md", "docs/validation/demo.md"
 SPEED, REFERENCES = "docs/validation/speed_error.md", "docs/validation/references.md"
 
@@ -188,6 +188,19 @@ def claims():
          [stated("memory of reading over the size of the file", setting="4 GB")]),
         (RESOURCES, "reading takes {:.1f} times the file (`--dataset",
          [stated("memory of reading over the size of the file", setting="pyKLIP dataset, 0.2 GB")]),
+        # -- steps before a reduction
+        *((SPACEKLIP, f"{what} | {{:{form}f}}",
+           [float(rows("stage2_steps", step=step)["limits"][0])])
+          for step, what, form in (
+              ("background", "no harm: it is fitted", ".2"),
+              ("1/f, star masked", "only if stripes are seen", ".2"),
+              ("1/f, star not masked", "the star not masked | no", ".2"),
+              ("flagged pixels", "before a shift; otherwise not needed", ".2"),
+              ("pixels found by clipping", "it takes the star's sharp structure", ".1"),
+              ("NaN to zero", "`replace_nans` | before a shift", ".2"),
+              ("cropping", "only a square about the star is fitted", ".2"),
+              ("recentring, recorded", "as `IMSHIFTS` records the shift", ".2"),
+              ("recentring, not recorded", "is lost", ".2"))),
         # -- paper
         (PAPER, "factors of {:.1f} (F356W) and {:.1f} (F444W) for HIP 17695, and of {:.1f} and "
          "{:.1f} for G 7-34",
