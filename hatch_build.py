@@ -1,8 +1,9 @@
 """Metadata of a distribution that depend on where its source is published.
 
 Where SOURCE_URL is set (the address of the repository) the links of the README are absolute, as an
-index of packages needs them, at the version that SOURCE_VERSION names; and the metadata have the
-project's addresses. The release workflow sets both. Elsewhere the README is as it is.
+index of packages needs them, at the version that SOURCE_VERSION names; its line that clones the
+repository has the address; and the metadata have the project's addresses. The release workflow sets
+both. Elsewhere the README is as it is.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class PublishedMetadata(MetadataHookInterface):
         source = os.environ.get("SOURCE_URL", "").rstrip("/")
         version = os.environ.get("SOURCE_VERSION", "main")
         if source:
-            text = absolute(text, source, version)
+            text = absolute(text, source, version).replace("SOURCE_URL", source)
             metadata["urls"] = {
                 "Source": source,
                 "Documentation": f"{source}/tree/{version}/docs",

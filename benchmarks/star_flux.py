@@ -7,7 +7,9 @@ Run from the root of the project, with the frames of programme 1184 in ../shared
         --opd ../shared/data/opd_2022-07-30.fits.gz
 
 The rolls of a target are fitted by `reduce`, and again with the star's flux held within 0.3 % of
-several values. It prints chi-squared and what is measured of the candidates.
+several values. It prints chi-squared and what is measured of the candidates. With ``--flat`` it
+fits every roll and all of them together from the map and from a flat wavefront, and prints the
+star's flux of the second fit over that of the first.
 """
 
 from __future__ import annotations
@@ -23,11 +25,31 @@ from pyklip_diffrender.refinement import jansky_per_unit, with_star_flux
 SHARES = (1.0, 0.9, 1.1, 1.2)
 
 
+def from_flat(sequence: dr.Sequence, opd: Path) -> None:
+    """Print the star's flux of fits from a flat wavefront over that of fits from a map."""
+    rolls = {f"roll {k + 1}": (each,) for k, each in enumerate(sequence.science)}
+    if len(sequence.science) > 1:
+        rolls["all rolls"] = sequence.science
+    for name, science in rolls.items():
+        alone = replace(sequence, science=science, references=())
+        measured, flat = (dr.reduce(alone, each).fit for each in (opd, "flat"))
+        print(
+            f"{sequence.target}, {sequence.filter}, {name}: "
+            f"{flat.frames[0].flux / measured.frames[0].flux:.2f} "
+            f"({measured.status.name} from the map, {flat.status.name} from a flat wavefront)",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Fit with several fluxes."""
     parser = real_frames_parser(__doc__, target=None, band=None)
+    parser.add_argument("--flat", action="store_true")
     options = parser.parse_args()
     sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
+    if options.flat:
+        from_flat(sequence, options.opd)
+        return
     first = dr.reduce(replace(sequence, references=()), options.opd).fit
     jansky = np.mean([frame.flux * (jansky_per_unit(frame) or np.nan) for frame in first.frames])
     print(f"{sequence.target}: {jansky:.4f} Jy; times it, chi-squared per pixel, candidates")

@@ -32,7 +32,8 @@ extensions = [
     "sphinx.ext.intersphinx",
     "sphinx.ext.viewcode",
 ]
-exclude_patterns = ["_build", "results"]
+# `_shared` has texts that several pages include.
+exclude_patterns = ["_build", "_shared", "results"]
 templates_path = ["_templates"]
 html_static_path = ["_static"]
 html_css_files = ["tables_and_figures.css"]
