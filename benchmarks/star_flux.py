@@ -15,6 +15,7 @@ star's flux of the second fit over that of the first.
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
