@@ -156,6 +156,63 @@ def _instrument_and_wavefront() -> list[Breakage]:
     ]  # fmt: skip
 
 
+def _rules_of_a_fit() -> list[Breakage]:
+    """The rules of "How a fit proceeds" in docs/concepts.md, each taken away."""
+    return [
+        Breakage(
+            "rule-alignment", "the alignment is fitted before the wavefront",
+            "skips_alignment = settings.wavefront and (not settings.free or self._is_warm)",
+            "skips_alignment = settings.wavefront", "refinement candidates hard",
+        ),
+        Breakage(
+            "rule-companions", "what the wavefront cannot explain gets unknowns of its own",
+            "bright = self._stalling(course) if stalled else []", "bright: list[Planet] = []",
+            "detection candidates",
+        ),
+        Breakage(
+            "rule-bad-pixels", "bad pixels that stand alone are left out",
+            "            if not self._leave_out_outliers(end, self._all_modes):\n",
+            "            if True:\n", "outliers",
+        ),
+        Breakage(
+            "rule-accurate-steps", "slow steps are followed by accurate ones",
+            "is_last = may_repeat and gain < self.settings.tolerance and kappa < _FAR",
+            "is_last = False", "gradient",
+        ),
+        Breakage(
+            "rule-wider-prior", "a prior that is too narrow is widened",
+            "        if not priors.are_improbable(ratios):\n            return settings\n",
+            "        if True:\n            return settings\n", "detection",
+        ),
+        Breakage(
+            "rule-wider-at-once", "a prior is widened to its size at once",
+            "if max(ratios.values()) < 1 + _SAME_SIZE:", "if True:", "detection",
+        ),
+        Breakage(
+            "rule-drift", "the drift between frames takes the size of the highest evidence",
+            "        if not before.drift:\n            return end, False\n",
+            "        return end, False\n", "visit short_wave",
+        ),
+        Breakage(
+            "rule-marginal-flux", "the flux of the star is marginal",
+            "if not priors.determined:", "if True:", "gradient",
+        ),
+        Breakage(
+            "rule-finer", "a rough fit that does not explain its data goes on",
+            "is_rough = settings.tolerance > _FINER and fit.status is Status.MODEL_MISMATCH",
+            "is_rough = False", "detection",
+        ),
+        Breakage(
+            "rule-old-map", "the prior is wider for an old map",
+            "if not self.adapt_prior or growth <= 1:", "if True:", "detection",
+        ),
+        Breakage(
+            "deeper-limits", "at every separation the deeper search is used",
+            "is_deeper = their_limits < limits", "is_deeper = their_limits < 0 * limits", "deeper",
+        ),
+    ]  # fmt: skip
+
+
 def _frames_and_files() -> list[Breakage]:
     return [
         Breakage(
@@ -387,6 +444,7 @@ def _around() -> list[Breakage]:
 
 
 BREAKAGES: tuple[Breakage, ...] = (
-    *_optics(), *_instrument_and_wavefront(), *_frames_and_files(), *_fits(), *_detection(),
+    *_optics(), *_instrument_and_wavefront(), *_rules_of_a_fit(), *_frames_and_files(), *_fits(),
+    *_detection(),
     *_around(),
 )  # fmt: skip
