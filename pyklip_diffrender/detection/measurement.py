@@ -275,7 +275,8 @@ def _correlations(covariance: Image, contrast_error: Image, sky: Sky) -> Iterato
         yield "xy_corr", correlation, None, ".3f", "correlation of x and y"
     turned = turn @ covariance @ turn.T
     for k, name in enumerate(names, 1):
-        values = turned[:, 0, k] / (contrast_error * np.sqrt(turned[:, k, k]))
+        with np.errstate(invalid="ignore"):
+            values = turned[:, 0, k] / (contrast_error * np.sqrt(turned[:, k, k]))
         about = f"correlation of contrast and {name if sky.north is None else f'delta_{name}'}"
         yield f"contrast_{name}_corr", values, None, ".3f", about
 
