@@ -106,6 +106,21 @@ def test_products_are_read_back(folder):
     assert not (folder / "copy").exists()
 
 
+@pytest.mark.slow
+def test_products_that_were_read_are_written_alike(tmp_path, monkeypatch):
+    monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"\x89PNG")
+    one, other = tmp_path / "one", tmp_path / "other"
+    reduction().write(one, derivatives=True)
+    again = dr.Reduction.read(one)
+    again.write(other, derivatives=True)
+    first, second = (json.loads((each / "summary.json").read_text()) for each in (one, other))
+    assert first == second
+    for name in ("candidates", "contrast"):
+        assert (one / f"{name}.ecsv").read_text() == (other / f"{name}.ecsv").read_text()
+    (row,) = again.detection.measure(separation=PLANET.separation, position_angle=40.0)
+    assert row["snr"] == pytest.approx(reduction().candidates["snr"][0], rel=0.05)
+
+
 def test_products_that_are_not_read_are_said(folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "copy")
     (copy / "disk.fits").write_text("of a disk", encoding="utf-8")

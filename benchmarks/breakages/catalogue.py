@@ -166,8 +166,8 @@ def _rules_of_a_fit() -> list[Breakage]:
         ),
         Breakage(
             "rule-companions", "what the wavefront cannot explain gets unknowns of its own",
-            "bright = self._stalling(course) if stalled else []", "bright: list[Planet] = []",
-            "detection candidates",
+            "return self.objective.at(*state.unknowns.with_companions(added, state.vector))",
+            "return state", "detection candidates",
         ),
         Breakage(
             "rule-bad-pixels", "bad pixels that stand alone are left out",
@@ -374,8 +374,8 @@ def _detection() -> list[Breakage]:
     return [
         Breakage(
             "sky-mirror", "east is left of north in tables",
-            "return np.array([[-cosine, sine], [sine, cosine]])",
-            "return np.array([[cosine, sine], [-sine, cosine]])", "sky",
+            "return np.diag([-1.0, 1.0]) @ rotation_matrix(degrees)",
+            "return rotation_matrix(degrees)", "sky",
         ),
         Breakage(
             "small-sample", "limits near the star have the small-sample correction",
@@ -445,6 +445,5 @@ def _around() -> list[Breakage]:
 
 BREAKAGES: tuple[Breakage, ...] = (
     *_optics(), *_instrument_and_wavefront(), *_rules_of_a_fit(), *_frames_and_files(), *_fits(),
-    *_detection(),
-    *_around(),
+    *_detection(), *_around(),
 )  # fmt: skip
