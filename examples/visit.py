@@ -7,8 +7,8 @@ from the root of the project::
     python examples/visit.py visit
 
 Headers are those of calibrated files (calints) of the JWST pipeline. The images are rendered with
-128 samples across the pupil, a wavefront that has drifted since the map and from frame to frame, and
-a flat field with an error of 1 % in every pixel. Nothing of it is from the telescope.
+128 samples across the pupil, a wavefront that has drifted since the map and from frame to frame,
+and a flat field with an error of 1 % in every pixel. Nothing of it is from the telescope.
 """
 
 from __future__ import annotations
