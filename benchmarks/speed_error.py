@@ -18,7 +18,7 @@ point; ways that differ in one setting, such as the samples across the pupil, ar
 The error of images and fits is the rms error of the star in units of the noise (sigma). Takes about
 four minutes on two idle cores, of which stpsf takes one, and two more for one roll of real frames;
 without stpsf and its data (STPSF_PATH) its points are left out. ``--quick`` sees whether all runs.
-Writes speed_error.ecsv and speed_error.png, which the documentation shows.
+Writes speed_error.ecsv, and a figure for images and one for fits, which the documentation shows.
 """
 
 from __future__ import annotations
@@ -35,9 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from astropy.table import Table
-from matplotlib.artist import Artist
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -65,14 +63,19 @@ ADAM_STEPS, LEARNING_RATE = 1000, 1e-11
 _OTHERS = ("the paper's recipe", "stpsf", "poppy", "prysm", "hcipy", "KLIP")
 """Ways of other codes begin with one of these."""
 
-TITLES = {
-    "image": "One image, 4.5 um",
-    "broad image": "One image in F444W",
-    "gradient": "Image and gradient, 4.5 um",
-    "fit": "Fit of one frame, 4.5 um",
-    "reduction": "Reduction of real frames",
+FIGURES = {
+    "image": {
+        "fewer samples across the pupil": "this package, 128 to 1024 samples",
+        "stpsf calc_psf": "stpsf",
+        "the paper's recipe": "the paper's renderer",
+    },
+    "fit": {
+        "fewer modes of the wavefront": "this package, modes to 8 to 24 cycles",
+        "KLIP": "KLIP",
+        "the paper's recipe": "the paper's fit",
+    },
 }
-"""Titles of the panels by what they compare."""
+"""Tasks that have a figure, with the ways that it shows and their labels."""
 
 UNITS = {
     "image": "rms error (sigma)",
@@ -81,7 +84,7 @@ UNITS = {
     "fit": "rms error of the star (sigma)",
     "reduction": "median change of the limits",
 }
-"""Meaning of the errors in each panel."""
+"""Meaning of the errors of each task."""
 
 
 class Point(NamedTuple):
@@ -90,7 +93,7 @@ class Point(NamedTuple):
     Attributes
     ----------
     what : str
-        Key of `TITLES`.
+        Key of `UNITS`.
     way : str
         Points of one way are joined by a line.
     setting : str
@@ -404,51 +407,26 @@ def as_table(points: Sequence[Point], command: str) -> Table:
     return table
 
 
-def draw(table: Table) -> Figure:
-    """Error against time, a panel for images, gradients and fits, a line for each way."""
-    shown = [what for what in TITLES if what in set(table["what"])]
-    ways = dict.fromkeys(map(str, table["way"]))
-    colors = {way: f"C{k}" if k < 10 else f"{k / 10 - 1}" for k, way in enumerate(ways)}
-    count = len(shown) // 2 + 1
-    figure = Figure(figsize=(9, 4.2 * count), layout="constrained")
-    *panels, last = figure.subplots(count, 2, squeeze=False).flat
-    handles: dict[str, Artist] = {}
-    for ax in panels[len(shown) :]:
-        ax.set_axis_off()
-    for ax, what in zip(panels, shown, strict=False):
-        rows = table[table["what"] == what]
-        ax.margins(0.2)
-        lines = {way: rows[rows["way"] == way] for way in dict.fromkeys(map(str, rows["way"]))}
-        for way, line in lines.items():
-            ours = not way.startswith(_OTHERS)
-            errors = np.maximum(line["error"], 1e-16)
-            (handles[way],) = ax.loglog(
-                line["seconds"], errors, "o-" if ours else "s--", color=colors[way], ms=6,
-                mfc=None if ours else "none",
+def draw(table: Table, what: str) -> Figure:
+    """Error against time for one task; a line for each way to do it that a user can choose."""
+    figure = Figure(figsize=(6.2, 4.2), layout="constrained")
+    ax = figure.subplots()
+    rows = table[table["what"] == what]
+    for way, label in FIGURES[what].items():
+        line = rows[rows["way"] == way]
+        marker = "s--" if way.startswith(_OTHERS) else "o-"
+        ax.loglog(line["seconds"], line["error"], marker, ms=6, label=label)
+        for each in {0, len(line) - 1} if len(line) > 1 else ():
+            ax.annotate(
+                str(line["setting"][each]), (line["seconds"][each], line["error"][each]),
+                xytext=(6, 5), textcoords="offset points", fontsize=7,
             )  # fmt: skip
-            # Labels are above their points, but for those that would be on others.
-            is_lowest = errors[-1] == min(other["error"][-1] for other in lines.values())
-            is_right_of_another = any(
-                other["seconds"][0] < line["seconds"][0]
-                and abs(other["error"][0] / errors[0] - 1) < 0.2
-                for other in lines.values()
-            )
-            ends = {len(line) - 1: is_lowest} | {0: is_right_of_another}
-            for each, below in ends.items():
-                ax.annotate(
-                    str(line["setting"][each]), (line["seconds"][each], errors[each]),
-                    xytext=(5, -11 if below else 4), textcoords="offset points", fontsize=8,
-                )  # fmt: skip
-        ax.set(title=TITLES[what], xlabel="time (s)", ylabel=UNITS[what])
-        if "sigma" in UNITS[what]:
-            # The noise of a pixel.
-            ax.axhline(1.0, color="0.7", lw=1, zorder=0)
-        left, right = ax.get_xlim()
-        ax.set_xlim(left, right * (right / left) ** 0.2)  # For the labels.
-        if right < 20 * left:
-            ax.xaxis.set_minor_formatter(ScalarFormatter())
-    last.set_axis_off()
-    last.legend(list(handles.values()), list(handles), loc="center left", frameon=False)
+    ax.margins(0.15)
+    left, right = ax.get_xlim()
+    ax.set_xlim(left, right * (right / left) ** 0.25)  # For the labels.
+    ax.set(xlabel="time (s)", ylabel=UNITS[what])
+    ax.axhline(1.0, color="0.7", lw=1, zorder=0)  # The noise of a pixel.
+    figure.legend(loc="outside upper center", ncols=3, fontsize=8, frameon=False)
     return figure
 
 
@@ -481,7 +459,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         table = as_table(points, command)
         write_table(table, options.output / "speed_error.ecsv")
         table["what", "way", "setting", "seconds", "error", "status"].pprint_all()
-    save(draw(table), options.output / "speed_error.png")
+    for what in FIGURES:
+        save(draw(table, what), options.output / f"speed_error_{what}.png")
     return 0
 
 

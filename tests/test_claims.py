@@ -216,9 +216,13 @@ def claims():
         # -- real frames
         *((PAGE, f"| {star}, {band} | {{:.2f}} ({{:.2f}}) | {{:.2f}} ({{:.2f}}) | {{:.2f}} "
            "({:.2f}) |", ratios(star, band)) for star, band in PAIRS),
-        (PAGE, "the S/N scatters by {:.2f} to {:.2f}.",
+        (PAGE, "the S/N scatters by {:.2f} to {:.2f} after the errors",
          [stated(f"S/N deviation beyond 0.3 arcsec, {each}", setting="two rolls")
           for each in ("smallest", "largest")]),
+        (PAGE, "after the errors are scaled, by {:.2f} to {:.2f}.",
+         [f(table(LIMITS)["error_factor"]) for f in (min, max)]),
+        (PAGE, "for one of them {:.1f} times",
+         [stated("star's flux from a flat wavefront over that from a map, largest")]),
         (PAGE, "F444W are {:.1f} to {:.1f} times higher.",
          [stated(f"limits without a pattern over those with it, {each}")
           for each in ("smallest", "largest")]),
@@ -230,7 +234,7 @@ def claims():
         (PAGE, "at 2 arcsec the ratios are {:.2f} and {:.2f}.",
          [stated("ratio of limits of product images, at 2.0 arcsec", filter=band,
                  setting="cleaned") for band in BOTH]),
-        (PAGE, "in F356W it comes out {:.2f} times as large",
+        (PAGE, "in F356W it comes out {:.2f} times as large,",
          [stated("factor by which contrasts are too low without a map")]),
         (PAGE, "keeps {:.2f} and {:.2f} of it.", disk("disk=True, fitted light", *BOTH)),
         (PAGE, "KLIP keeps {:.2f} and {:.2f} with one mode, and {:.2f} and {:.2f} with five.",
