@@ -51,7 +51,7 @@ The number was not measured."""
 
 
 def batch_of(size: int, dtype: torch.dtype, device: torch.device) -> int:
-    """Return how many arrays of `size` elements to compute at a time, at least 1."""
+    """Number of arrays of `size` elements to compute at a time, at least 1."""
     available = _CPU_ARRAY_BYTES if device.type == "cpu" else _GPU_ARRAY_BYTES
     return max(1, int(available / (size * dtype.itemsize)))
 
@@ -110,7 +110,7 @@ class Propagation:
 
     @property
     def route(self) -> str:
-        """How light gets to the detector: "lattice" or "planes"."""
+        """Propagation to the detector, "lattice" or "planes"."""
         return "planes" if self._lattice is None else "lattice"
 
     @property

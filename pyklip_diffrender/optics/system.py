@@ -72,8 +72,6 @@ class OpticalSystem(Propagation):
 
     Attributes
     ----------
-    planes : tuple
-        The entrance pupil, the planes in between, the detector.
     defaults : dict of str to Tensor
     maker : callable or None
         `remake`.
@@ -261,16 +259,17 @@ class OpticalSystem(Propagation):
         Parameters
         ----------
         wavelength : Quantity, float (m) or sequence of them, optional
-            Default: the wavelengths that the system was made for.
+            By default, the wavelengths of the system.
         weight : sequence of float, optional
-            One per wavelength; default equal.
+            Weights of the wavelengths. By default equal if there is a `wavelength`, otherwise as in
+            the system.
         source : dict, optional
-            With "wavelengths" and "weights", in place of the two above.
+            "wavelengths" and "weights", in place of the two arguments above.
         normalize : str
             "first", "last", "exit_pupil" or "none", as in poppy.
         return_intermediates, return_final : bool
-            Also return a list of `poppy.Wavefront`, one for every plane or the one on the detector,
-            summed over wavelengths as in poppy. Only systems of `from_poppy` have them.
+            Also return a list of `poppy.Wavefront`, for every plane or for the detector alone,
+            summed over wavelengths as in poppy. Only systems of `from_poppy` have these objects.
         display : bool
             Draw the PSF in a new figure of matplotlib, on a logarithmic scale.
         opd, **parameters
@@ -288,7 +287,7 @@ class OpticalSystem(Propagation):
         ------
         IncompatibleSetupError
             For a keyword that this system does not serve, with the reason, for wavelengths at which
-            its planes are not known, and for an unknown `normalize`.
+            the planes are not known, and for an unknown `normalize`.
         """
         refuse_keywords(self._refused, locals())
         if source is not None:
@@ -309,7 +308,7 @@ class OpticalSystem(Propagation):
     def _intermediates(
         self, normalize: str, opd: Value | None, parameters: Mapping[str, Value], only_last: bool
     ) -> list[Any]:
-        """Fields at the planes as `poppy.Wavefront`; systems without them refuse the keyword."""
+        """Fields at the planes as `poppy.Wavefront`; other systems refuse the keywords."""
         raise NotImplementedError
 
     def describe(self) -> str:
@@ -330,10 +329,11 @@ class OpticalSystem(Propagation):
         IncompatibleSetupError
             For keywords if the planes are not poppy's.
         """
-        for name, value in keywords.items():
+        if keywords:
+            given = ", ".join(f"{name}={value!r}" for name, value in keywords.items())
             raise IncompatibleSetupError(
-                f"{name}={value!r}: the planes of this system are no optics of poppy; plot(ax, "
-                "opd=...) takes the axes to draw in and a wavefront"
+                f"{given}: the planes of this system are no optics of poppy; plot(ax, opd=...) "
+                "takes the axes to draw in and a wavefront"
             )
         self.plot()
 
@@ -450,13 +450,13 @@ class InstrumentSystem(OpticalSystem):
         normalize : str
             "first", "last", "exit_pupil" or "none", as in poppy.
         add_distortion : bool, optional
-            Add extensions OVERDIST and DET_DIST; default in systems of `from_webbpsf`, which alone
-            have them.
+            Add extensions OVERDIST and DET_DIST; the default in systems of `from_webbpsf`, which
+            alone have these extensions.
         crop_psf : bool
             As in stpsf; without effect where there is no distortion.
         return_intermediates : bool
-            Also return a list of `poppy.Wavefront`, one per plane; systems of `from_webbpsf` alone
-            have them.
+            Also return a list of `poppy.Wavefront`, one per plane. Only systems of `from_webbpsf`
+            have these objects.
         save_intermediates
             Refused with a pointer to what does the same.
         opd, **parameters
