@@ -185,10 +185,6 @@ def _rules_of_a_fit() -> list[Breakage]:
             "        if True:\n            return settings\n", "detection",
         ),
         Breakage(
-            "rule-wider-at-once", "a prior is widened to its size at once",
-            "if max(ratios.values()) < 1 + _SAME_SIZE:", "if True:", "detection",
-        ),
-        Breakage(
             "rule-drift", "the drift between frames takes the size of the highest evidence",
             "        if not before.drift:\n            return end, False\n",
             "        return end, False\n", "visit short_wave",
