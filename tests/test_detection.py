@@ -153,7 +153,7 @@ def test_a_prior_of_another_size_is_adapted(world, monkeypatch):
 
 
 def test_a_prior_that_is_far_too_narrow_reaches_its_size_at_once(world, caplog):
-    """The linear model tells how far, so that the wavefront is fitted once more, not three times."""
+    """The linear model tells how far, so that the wavefront is fitted once more, not more often."""
     likely = world.fitted(4)
     narrow = WavefrontPrior({n: scale / 8 for n, scale in likely.scales.items()}, fit_scales=False)
     with caplog.at_level("INFO", logger="pyklip_diffrender"):

@@ -16,16 +16,15 @@ MAX_CHI2 = 100.0
 _ADVICE = {
     Status.CONVERGED: "The stated errors and limits can be used as they are.",
     Status.MODEL_MISMATCH: (
-        "3 of the 7 reductions of real frames in the documentation end with this status: two of a "
-        "star with a disk, and one with a flat-field pattern that is not that of the library. "
-        "Errors of candidates are scaled to the scatter in the S/N map. See whether a faint "
-        "candidate is in every roll and looks like a point source, and check the filter, the masks "
-        "and the date of the wavefront map. For a star with a disk, use the option disk."
+        "Errors of candidates are scaled to the scatter in the S/N map, and the reduction takes "
+        "part in a combined search. See whether a faint candidate is in every roll and looks like "
+        "a point source, and check the filter, the masks and the date of the wavefront map. For a "
+        "star with a disk, use the option disk."
     ),
     Status.PRIOR_MISMATCH: (
-        "Errors of candidates are scaled to the scatter in the S/N map. Repeat the reduction with "
-        "a wavefront map nearer in time or, in Python, with WavefrontPrior(fit_scales=True), which "
-        "lets the data determine how much the wavefront may change."
+        "The prior was widened to the size of the wavefront, which still exceeds it. Errors of "
+        "candidates are scaled to the scatter in the S/N map, and the reduction takes part in a "
+        "combined search. Check the wavefront map, and take one that is nearer in time."
     ),
     Status.ITERATION_LIMIT: (
         "The result is the best iterate. If chi-squared was still falling in the history of the "
