@@ -242,6 +242,8 @@ def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Iterator[Tensor
         yield total
 
 
+# The linear model of a fit: the Jacobian of all unknowns and their posterior covariance.
+
 _BATCH = 512
 """Number of templates that are processed at a time."""
 
