@@ -141,6 +141,17 @@ def test_contributions_of_reference_frames_are_read_back():
     np.testing.assert_equal(asdict(Visit.from_facts(json.loads(json.dumps(facts)))), asdict(visit))
 
 
+def test_limits_of_a_calibrated_star_have_vega_magnitudes(tmp_path):
+    detection = replace(reduction().detection)
+    vars(detection)["sky"] = replace(detection.sky, star=(0.4, 0.04))
+    detection.write(tmp_path)
+    curve = QTable.read(tmp_path / "contrast.ecsv")
+    # AB less Vega magnitude in F444W: other spectra of Vega agree within 0.02.
+    expected = (0.4 * curve["contrast"] * u.Jy).to_value(u.ABmag) - 3.237
+    np.testing.assert_allclose(curve["vega_mag"].value, expected, atol=0.02)
+    assert "vega_mag" not in dr.Detection.read(tmp_path).contrast_curve.colnames
+
+
 def test_limits_of_a_reduction_are_those_of_its_curve():
     result = reduction()
     found, curve = result.limits(), result.contrast_curve

@@ -370,8 +370,8 @@ def _detection() -> list[Breakage]:
     return [
         Breakage(
             "sky-mirror", "east is left of north in tables",
-            "return np.diag([-1.0, 1.0]) @ rotation_matrix(degrees)",
-            "return rotation_matrix(degrees)", "sky",
+            "np.diag([-1.0, 1.0]) @ rotation_matrix(degrees)",
+            "np.diag([1.0, 1.0]) @ rotation_matrix(degrees)", "sky plotting",
         ),
         Breakage(
             "small-sample", "limits near the star have the small-sample correction",

@@ -334,10 +334,10 @@ def provenance_of(detection: Any) -> dict[str, object]:
 def write_detection(detection: Any, folder: Path, *, overwrite: bool) -> list[Path]:
     """Write a `Detection`; see its method `write`."""
     maps, positions = folder / "detection.fits", folder / "astrometry.csv"
-    tables = {
-        folder / "candidates.ecsv": detection.candidates,
-        folder / "contrast.ecsv": detection.contrast_curve,
-    }
+    curve, limits = detection.contrast_curve.copy(), detection.limits()
+    if "mag" in limits.colnames:
+        curve["vega_mag"] = limits["mag"]
+    tables = {folder / "candidates.ecsv": detection.candidates, folder / "contrast.ecsv": curve}
     beside = folder / _OTHER
     require_new([maps, *tables, positions, beside], overwrite)
     write_fits(_hdus_of(detection), maps)
