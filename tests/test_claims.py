@@ -372,6 +372,12 @@ def test_the_readme_takes_a_minute():
     assert 6 < len(re.findall(r"(?<![\w.])\d[\d.]*", prose)) <= 12
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "docs/howto").glob("*.md")), ids=lambda p: p.stem)
+def test_guides_are_short(path):
+    """What was measured, and how, belongs to the pages of validation."""
+    assert len(path.read_text(encoding="utf-8").split()) <= 1200
+
+
 def test_how_often_real_frames_are_not_explained():
     """The page on statuses says how often one comes, of the reductions on the page."""
     name, explained = "chi-squared per pixel", 1.2  # the limit of CONVERGED
