@@ -1,6 +1,6 @@
 """Table of the free parameters of models and fits, with their units and ranges.
 
-It defines the keywords of the forward model, the parameters of the fit, and the FITS columns.
+The table defines the keywords of the forward model, the parameters of the fit, and FITS columns.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ class Parameter:
     name: str  # the keyword of the forward model
     unit: str  # at the interface, in astropy's spelling ("" for a plain number)
     size: int  # number of components
-    default: float  # when it is not given
+    default: float  # value when none is given
     start: float  # from which a fit starts when none is given
     lower: float  # bound of every component
     upper: float
-    prior: float  # standard deviation about the start, generous as without any earlier measurement
+    prior: float  # standard deviation about the start, wide as without any earlier measurement
     label: str  # a few words for tables, with ``{}`` for the component: x, y or its number
     description: str  # one line
 
@@ -75,7 +75,7 @@ LEVELS = (
         "image",
     ),
 )  # fmt: skip
-"""Free parameters of an observation, besides those of the optics."""
+"""Free parameters of an observation, besides the parameters of the optics."""
 
 
 def parameter(name: str) -> Parameter:

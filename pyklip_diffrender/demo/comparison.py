@@ -1,6 +1,6 @@
 """The demo: a simulated planet near a star, with a wavefront map that is 40 hours old.
 
-The scene is that of Feng et al. 2025 with a seeded wavefront in place of the measured one: 4.5 um,
+The scene follows Feng et al. 2025, with a seeded wavefront in place of the measured one: 4.5 um,
 beta Pictoris for two hours, 80 x 80 pixels; KLIP has nine dithered images of alpha Pictoris, taken
 three hours later and 10 mas off (their appendix C).
 """
@@ -100,7 +100,7 @@ def run_demo(
 ) -> DemoResult:
     """Simulate, refine, subtract, and run KLIP on the same frame of `size` pixels a side.
 
-    The planet's place is in arcsec and degrees. The wavefront map is `hours` old; `seed` is that of
+    The planet's place is in arcsec and degrees. The wavefront map is `hours` old; `seed` determines
     wavefront, drift and noise.
     """
     planet = Planet(contrast, separation, position_angle)

@@ -71,9 +71,9 @@ def is_jwst_pupil(lit: Tensor, diameter: float) -> bool:
 def jwst_pupil(npix: int, segment_gap: float | None = None, pupil: str = "design") -> Tensor:
     """Amplitude transmission of JWST's entrance pupil, (npix, npix) over 6.603464 m, float64.
 
-    It is the covered fraction of a pixel's area. `segment_gap` is the width of the gaps between the
-    segments, m, by default that of the embedded outlines, 7.7 mm. IncompatibleSetupError for a
-    `pupil` other than "design" or "flight".
+    The transmission is the covered fraction of a pixel's area. `segment_gap` is the width of the
+    gaps between the segments, m, by default 7.7 mm as in the embedded outlines.
+    IncompatibleSetupError for a `pupil` other than "design" or "flight".
     """
     # Struts of the secondary mirror as designed (stpsf's pupil "RevW"), or as in NIRCam's pupil
     # images ("Flight V1": the vertical strut is 7 % narrower, and all three have hinges). Behind

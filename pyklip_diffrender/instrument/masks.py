@@ -25,8 +25,8 @@ LONG_WAVE = (
     "F460M", "F480M",
 )  # fmt: skip
 FILTERS = SHORT_WAVE + LONG_WAVE
-"""Filters that go with a Lyot stop. Those of both channels go with every mask, for the two take
-their frames at once."""
+"""Filters that go with a Lyot stop. Filters of both channels go with every mask, because the two
+channels take their frames at once."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +139,9 @@ MASKS: dict[str, RoundMask | BarMask] = {
 
 
 FIELD = 20.2
-"""Side of the square about a mask in which sources are seen past it, arcsec. It is 20 arcsec wide
-(JWST user documentation, "NIRCam Coronagraphic Occulting Masks and Lyot Stops") and the subarrays
-SUB320 and SUB640 hold it; a frame of the whole detector shows other masks beyond."""
+"""Side of the square about a mask in which sources are seen past it, arcsec. The field is 20 arcsec
+wide (JWST user documentation, "NIRCam Coronagraphic Occulting Masks and Lyot Stops") and the
+subarrays SUB320 and SUB640 hold it; a frame of the whole detector shows other masks beyond."""
 
 
 @dataclass(frozen=True)
@@ -149,13 +149,13 @@ class DetectorPlace:
     """Where a mask is imaged on a detector, and the pixels there."""
 
     mask: str
-    # Place along a bar: a filter, at whose fiducial it is, or "NARROW"; "-" is the middle.
+    # Place along a bar: a filter, for its fiducial, or "NARROW"; "-" is the middle.
     place: str
     # As SIAF names it: NRCA2, NRCA4, NRCB1 or NRCB3 (short wave), NRCA5 or NRCB5 (long wave).
     detector: str
     # x, y of the mask on the full detector in F335M (short wave: F210M), pixels of the science
-    # frame counted from 0 at the middle of the first one. In another filter add `filter_shift`. In
-    # module B it is that of the SIAF, which in module A is up to 3.4 pixels away.
+    # frame counted from 0 at the middle of the first one. In another filter add `filter_shift`.
+    # Module B has the place of the SIAF, which in module A is up to 3.4 pixels away.
     center: tuple[float, float]
     siaf_pixelscale: tuple[float, float]  # x, y, arcsec per pixel (SIAF, PRDOPSSOC-075)
     # Growth of the ideal y with the ideal x, from the SIAF polynomial: the mean over +-40 pixels.
@@ -170,7 +170,7 @@ class DetectorPlace:
     def period(self, bar_reach: float | None = None) -> float:
         """Least period of the star's image, arcsec, for a copy of it not to touch a bar.
 
-        `bar_reach` is that of `nircam_coronagraph`.
+        For `bar_reach` see `nircam_coronagraph`.
         """
         # The copy of the star, of a radius of its own, one period away is then beyond the end of
         # the bar.
@@ -237,11 +237,11 @@ def require_mask(mask: str) -> RoundMask | BarMask:
 def detector_place(
     mask: str | None, filter: str, place: str | None = None, module: str = "A"
 ) -> DetectorPlace:
-    """Where a mask is imaged in a filter, and the pixels there.
+    """Place of a mask on the detector in a filter, and the pixels there.
 
-    Without a mask it is the place of the one that is made for the filter's channel
-    (MASK210R or MASK335R). `place` is that of the star along a bar: a filter of its channel, at
-    whose fiducial it is, "NARROW", or "-", the middle; default the fiducial of `filter`, or the
+    Without a mask, the place belongs to the mask that is made for the filter's channel
+    (MASK210R or MASK335R). `place` is the star's along a bar: a filter of its channel, for the
+    fiducial of that filter, "NARROW", or "-", the middle; default the fiducial of `filter`, or the
     middle if it has none. IncompatibleSetupError for an unknown mask, filter, place or module, or a
     mask that the module does not have in the filter's channel.
     """
@@ -274,8 +274,8 @@ def detector_place(
 
 def stop_is_measured(mask: str | None, short_wave: bool, module: str | None = None) -> bool:
     """Whether the alignment of the Lyot stop of a mask was measured in flight."""
-    # That of MASKRND, the stop of all masks but the bars, was measured in the long-wave channel of
-    # A.
+    # The alignment of MASKRND, the stop of all masks but the bars, was measured in the long-wave
+    # channel of module A.
     is_bar = isinstance(MASKS.get(mask or ""), BarMask)
     return not is_bar and not short_wave and module != "B"
 
@@ -312,7 +312,7 @@ _SHIFTS = {
 
 
 def filter_shift(name: str) -> tuple[float, float]:
-    """How far the image of the mask, and of the sky with it, lies from where it is in F335M.
+    """Shift of the image of the mask, and of the sky with it, from its place in F335M.
 
     x, y in pixels of the filter's channel, science frame; short-wave filters are relative to F210M.
     IncompatibleSetupError for a filter whose shift was not measured.

@@ -90,8 +90,8 @@ def internal_wavefront_error(
 ) -> Tensor:
     """NIRCam's internal wavefront error at a mask: Noll coefficients in m, (36,), float64.
 
-    They are in entrance-pupil orientation, of the map flipped vertically; with `flip` False of the
-    map in the tabulated orientation, that of the exit pupil, as stpsf took it before 2.2.0.
+    The coefficients are in entrance-pupil orientation, of the map flipped vertically; with `flip`
+    False, of the map in the tabulated orientation of the exit pupil, as in stpsf before 2.2.0.
     """
     # STScI's table has the same values for B as for A, at places mirrored in V2. There the two bars
     # change places.
@@ -190,13 +190,13 @@ def nircam_coronagraph(
     Parameters
     ----------
     filter : str
-        A filter of the short-wave channel (F182M, F187N, F200W, F210M, F212N) or of the long-wave
-        one (F250M to F480M), which decides on the detector. Its bandpass is used unless
+        Filter of the short-wave channel (F182M, F187N, F200W, F210M, F212N) or of the long-wave
+        channel (F250M to F480M), which decides on the detector. Its bandpass is used unless
         `monochromatic` is given.
     fov_pixels : int or (ny, nx), optional
         Detector pixels; default 80.
     fov_arcsec : float, optional
-        In place of `fov_pixels`.
+        Field of view in place of `fov_pixels`.
     oversample : int
         Samples per pixel along each axis; pixels are their mean. 1 samples pixel centres.
     monochromatic : float, optional
@@ -209,7 +209,7 @@ def nircam_coronagraph(
         arcsec; default the square scale of stpsf at the mask. For real frames, whose pixels are
         not square on the sky, ``detector_place(mask, filter).siaf_pixelscale``.
     shear : float
-        See `Detector`; ``siaf_shear`` of the same for real frames.
+        See `Detector`; for real frames, ``detector_place(mask, filter).siaf_shear``.
     crosstalk : bool
         Couple neighbouring pixels as in the detector NRCA5 (interpixel capacitance and post-pixel
         coupling), which the pipeline does not remove from calibrated JWST frames.
@@ -217,17 +217,17 @@ def nircam_coronagraph(
         "MASK210R", "MASK335R", "MASK430R", or the bars "MASKSWB" and "MASKLWB", each with the
         filters of both channels, or None for no occulter (a planet far from the star).
     module : "A" or "B"
-        JWST observes with A. For what there is in B see `detector_place`.
+        JWST observes with A. For masks and filters in B see `detector_place`.
     bar_place : str, optional
         Where along a bar the star is: at the fiducial of a filter, such as "F460M", at the
         "NARROW" end, or in the middle, "-". Default the fiducial of `filter`, or the middle if
-        it is one of the other channel.
+        `filter` is of the other channel.
     pupil_mask : "auto", "MASKRND", "MASKBAR" or None
-        Lyot stop; "auto" is that of the mask.
+        Lyot stop; "auto" is the stop of the mask.
     pupil : "design" or "flight"
         Obscurations of the primary mirror, see `jwst_pupil`.
     segment_gap : float, optional
-        Width of the gaps between mirror segments, m; default that of the embedded outlines.
+        Width of the gaps between mirror segments, m; default as in the embedded outlines.
     si_wfe : bool or (36,) array
         Include the instrument's internal wavefront error at the mask, or Noll coefficients for it
         (m, orientation of the exit pupil, for a wavelength of 3.23 um; short wave 2.12 um).
@@ -342,7 +342,7 @@ def _require_supported(place: DetectorPlace, recipe: Mapping[str, Any]) -> None:
         )
     if recipe["crosstalk"] and place.detector != "NRCA5":
         raise IncompatibleSetupError(
-            f"crosstalk: the embedded kernels are those of the detector NRCA5, and "
+            f"crosstalk: the embedded kernels are for the detector NRCA5, and "
             f"{recipe['filter']} is imaged on {place.detector}; use crosstalk=False"
         )
     if recipe["dtype"] not in (torch.float32, torch.float64):

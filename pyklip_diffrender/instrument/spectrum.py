@@ -185,13 +185,13 @@ _GAP = 1.6
 continuum of a star. Infrared photometry has points at 2.16, 3.35, 4.60 and 11.6 micron."""
 
 _RANGE = (2e-6, 5.2e-6)
-"""Wavelengths, m, at which the samples have to be as close as that."""
+"""Wavelengths, m, between which steps must be smaller than `_GAP`."""
 
 
 def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
     r"""Flux density of a star in a NIRCam filter, from its spectrum or its spectral type.
 
-    It is the mean over detected photons,
+    The flux density is the mean over detected photons,
     ``integral(F_nu T dnu / nu) / integral(T dnu / nu)`` with the throughput T of the filter, to
     which the calibration of JWST refers (Gordon et al. 2022, AJ 163, 267).
 
@@ -199,7 +199,7 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
     ----------
     star : path or str
         File with the spectrum or photometry: a table in text (also CSV, ECSV, CDS and IPAC), FITS
-        or VOTable, gzipped or not. Units are those of the columns, or stand in their names
+        or VOTable, gzipped or not. Units are given with the columns, in their names
         ("flux_mJy") or in comments ("# ANGSTROM FLAM"); without any, they are micron and Jy, and a
         warning is logged. Columns of errors are left out.
         Or spectral type of a dwarf (B5 to M9) and its 2MASS Ks magnitude, such as "A2V, K=6.77".
@@ -272,8 +272,8 @@ def mean_in_filter(
 def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
     """Read the spectrum of a star: wavelengths, m, increasing, and flux densities, Jy.
 
-    See `star_flux_density` for the files. Of several columns that are no errors, the flux density
-    is the one called "flux", or the only one with such a unit. Samples at one wavelength are
+    See `star_flux_density` for the files. Among several columns without errors, the flux density
+    is the column called "flux", or the only column with such a unit. Samples at one wavelength are
     averaged by their median.
 
     MissingFileError if there is no such file, CorruptFileError if it is no table or has no positive
@@ -388,7 +388,7 @@ def _columns(path: Path, expected: str) -> tuple[Column, list[Column]]:
         raise MissingFileError(f"{path}: no such file; expected {expected}")
     try:
         with warnings.catch_warnings():
-            # Of units, which are judged here, and of deviations from the standard of VOTables.
+            # Warnings of units, which are judged here, and of deviations from VOTable's standard.
             warnings.simplefilter("ignore")
             table, comments = _table(path)
             if not len(table):
@@ -528,14 +528,14 @@ TEMPERATURES = (150, 175, 200, 250, 300, 350, 400, 500, 600, 750, 900, 1200, 150
 equal depth loses at most 0.2 % of the S/N of a planet between them."""
 
 _SAMPLES = np.geomspace(0.5e-6, 8e-6, 2001)
-"""Wavelengths of black bodies, m, which include those of every filter."""
+"""Wavelengths of black bodies, m, which include every filter's."""
 
 
 @dataclass(frozen=True)
 class PlanetSpectra:
     """Flux densities of planets in several filters."""
 
-    names: tuple[str, ...]  # of the spectra
+    names: tuple[str, ...]  # names of the spectra
     filters: tuple[str, ...]
     # (spectra, filters): mean flux density per frequency over the photons that the filter detects,
     # 1 in the filter where it is largest.

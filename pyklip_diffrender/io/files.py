@@ -75,7 +75,7 @@ def fits_files(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
-    """Content of a file, or of what is in a gzipped one."""
+    """Content of a file, unpacked if it is gzipped."""
     with _unpacked(Path(path)) as file:
         return file.read()
 
@@ -90,7 +90,7 @@ _PRODUCTS = {
     "RESIDUAL_SNR": "a search",
     "PATTERN": "a flat-field pattern",
 }
-"""Extensions by which products of this package are known, whose headers are those of frames."""
+"""Extensions by which products of this package are known; their headers are copied from frames."""
 
 
 def product_in(hdus: fits.HDUList) -> str:
@@ -124,7 +124,7 @@ def open_fits(path: str | os.PathLike[str], *, images: bool = True) -> Iterator[
                 warnings.filterwarnings(
                     "error", message="(?s).*(truncated|corrupt)", category=AstropyUserWarning
                 )
-                # Checksums of packed images are those of the tables that hold them.
+                # Packed images have the checksums of the tables that hold them.
                 stored = fits.open(
                     file, memmap=False, lazy_load_hdus=False, disable_image_compression=True
                 )
@@ -203,7 +203,7 @@ def read_image(
 
 def _require_sound(hdu: Any, number: int, path: Path, file: BinaryIO) -> None:
     """Check the cards and the checksums of an HDU as it is stored."""
-    # Damaged HDUs and those of unknown type have no data or no checksums.
+    # Damaged HDUs and HDUs of unknown type have no data or no checksums.
     if not (hasattr(type(hdu), "data") and hasattr(hdu, "verify_datasum")):
         raise CorruptFileError(
             f"{path}: extension {number} does not start as one (XTENSION, SIMPLE). Fetch it again"
@@ -269,11 +269,11 @@ def require_new(paths: Iterable[str | os.PathLike[str]], overwrite: bool) -> Non
 
 
 class OutputFolder:
-    """A folder for the products of a run, in which those of other runs are kept.
+    """A folder for the products of a run, in which products of other runs are kept.
 
     With `overwrite` a run may replace the products that are in the folder when it begins. What
-    somebody else writes there until it ends is not replaced: the products of the run then go to a
-    new folder inside, which is on the same disk and can be written to.
+    somebody else writes there until the run ends is not replaced: the products of the run then go
+    to a new folder inside, which is on the same disk and can be written to.
 
     Parameters
     ----------
@@ -335,7 +335,7 @@ class OutputFolder:
         Warns
         -----
         DiffrenderWarning
-            If they are not where they were asked for.
+            If the products are not where they were asked for.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         staged = self.folder / f".{secrets.token_hex(8)}"
@@ -399,7 +399,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Temporary path, in the same folder, for a file that replaces `path` if the block succeeds."""
     # In the same folder the replacement is one step. The suffix is the same
     # (``.fits.gz``, ``.png``), because some writers depend on it. The product has the permissions
-    # of the file that it replaces, or those of any new file.
+    # of the file that it replaces, or of any new file.
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = "".join(path.suffixes)
@@ -418,7 +418,7 @@ def write_fits(hdus: fits.HDUList, path: str | os.PathLike[str]) -> None:
     """Write a FITS file with checksums in one step, so that it is never incomplete."""
     hdus.update_extend()
     for hdu in hdus:
-        # Without the time, which astropy would note: the same content is the same file.
+        # Without the time, which astropy would note, so that the same content makes the same file.
         hdu.add_checksum(when="checksum of the extension")
     with replacing(path) as temporary:
         hdus.writeto(temporary, overwrite=True)

@@ -24,7 +24,7 @@ _SIMBAD = re.compile(r"(V|NAME|\*+)?\*?[\s_-]+", re.IGNORECASE)
 
 
 _SLIP = 0.6
-"""Least similarity of the digits of a name and of the same with one of three digits wrong."""
+"""Least similarity of the digits of two names if one is a slip: one of three digits is wrong."""
 
 _SIGN = re.compile(r"\+(?=\s*\d)")
 """A plus sign before digits, which belongs to the name: BD+20 1790 is not BD-20 1790."""
@@ -80,7 +80,7 @@ _UNKNOWN = ("", "UNKNOWN", "NULL", "N/A", "UNDEFINED")
 
 
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
-    """Cards of the primary header, replaced and completed by those of an extension.
+    """Cards of the primary header, replaced and completed by cards of an extension.
 
     CorruptFileError, with the `name` of the file, if a card cannot be read, or has invalid
     characters.
@@ -159,7 +159,7 @@ def header_text(header: fits.Header, key: str, name: str) -> str | None:
 def known_number(header: fits.Header, key: str) -> float | None:
     """Finite number of a card; None if it holds anything else.
 
-    For what is only told, and must not end a reduction; `header_number` is for what counts.
+    For values that are only reported, and must not end a reduction; see also `header_number`.
     """
     try:
         return header_number(header, key, "")
@@ -245,7 +245,7 @@ _DECLARED = (
     Keyword("DRIMAGE", "image in the products", "pyKLIP",
             "`cleaned`, `flux` or `subtracted`, see `DiffrenderSettings.image`."),
     Keyword("DRSTAT", "how the refinement ended", "reduce, pyKLIP",
-            "Name of a `Status`, such as `CONVERGED`; of several fits, that of the one with the "
+            "Name of a `Status`, such as `CONVERGED`; of several fits, the status with the "
             "largest chi-squared."),
     Keyword("DRCHI2", "chi-squared per fitted pixel", "reduce, pyKLIP",
             "Of several fits, the largest."),
@@ -276,13 +276,13 @@ _DECLARED = (
     Keyword("DRSYST", "flat-field pattern", "reduce, pyKLIP",
             "Its name, which lists the stars that it was learned from, or `none`."),
     Keyword("DRREFS", "reference frames that were used", "pyKLIP",
-            "Integrations of those that wavefront or pattern were fitted to."),
+            "Integrations to which wavefront or pattern were fitted."),
     Keyword("DRREFUSE", "", "pyKLIP",
             "What the frames of reference stars were used for, and why some were not."),
     Keyword("DRTHRU", "median throughput of faint sources", "pyKLIP",
             "Median of `-throughput.fits` over the fitted pixels."),
     Keyword("DRTHSTEP", "pixels between computed positions", "pyKLIP", "Of `-throughput.fits`."),
-    Keyword("DRFMFLUX", "fitted flux over that of the forward model", "pyKLIP",
+    Keyword("DRFMFLUX", "fitted flux over the forward model's flux", "pyKLIP",
             "Of forward models, as all keywords that begin with DRFM."),
     Keyword("DRFMFERR", "standard deviation of DRFMFLUX", "pyKLIP"),
     Keyword("DRFMFACT", "included factor for errors that are too small", "pyKLIP"),

@@ -15,7 +15,7 @@ Column = tuple[str, Any, Any, str, str]
 
 
 def add_columns(table: QTable, columns: Iterable[Column]) -> QTable:
-    """Add columns to a table, replacing those of the same name, and return it."""
+    """Add columns to a table, replacing columns of the same name, and return the table."""
     for name, values, unit, form, about in columns:
         table[name] = values if unit is None else values * unit
         table[name].info.format = form or None

@@ -37,7 +37,7 @@ def full_circle(degrees: Angle) -> Angle:
 
 
 def half_circle(degrees: Angle) -> Angle:
-    """Return the difference of two angles, from -180 to 180 degrees: that of 0.5 and 359.5 is 1."""
+    """Return a difference of two angles from -180 to 180 degrees, such as 1 for 0.5 and 359.5."""
     return (degrees + 180) % 360 - 180
 
 
@@ -62,7 +62,7 @@ def east_and_north(degrees: float) -> NDArray[np.float64]:
 # Convert input to float64 arrays in SI units or arcsec, and check it.
 
 Bound = Literal["any", "not negative", "positive"]
-"""Which finite numbers a value may be."""
+"""Range of finite numbers for a value."""
 
 _PLAUSIBLE_RMS = (1e-9, 2e-6)
 """Plausible rms of a wavefront of JWST, m."""
@@ -179,7 +179,7 @@ _SPELLINGS = {
     "erg s-1 cm-2 Angstrom-1": "flam", "erg s-1 cm-2 Hz-1": "fnu",
     "photon s-1 cm-2 Angstrom-1": "photlam", "photon s-1 cm-2 Hz-1": "photnu",
 }  # fmt: skip
-"""Units as files of spectra spell them, such as those of synphot, in capitals or not."""
+"""Units as files of spectra spell them, synphot's for example, in capitals or not."""
 
 _SPELLED = {
     word: unit

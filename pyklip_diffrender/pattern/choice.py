@@ -39,7 +39,7 @@ from pyklip_diffrender.wavefront.opd_map import OPDMap
 # Find which pixels of the detector frames show, from the pattern of the flat field itself.
 #
 # The detector pixels of frames that were shifted without a record are unknown. The residual of a
-# fit does: it correlates with the known pattern at only one position.
+# fit tells them: it correlates with the known pattern at only one position.
 
 _log = logging.getLogger(__name__)
 
@@ -65,23 +65,23 @@ _INNER = 0.3
 def place_on_detector(fit: Refinement, pattern: Systematics) -> Observation | None:
     """Move the frames of a fit onto the pixels of the detector that a pattern was measured on.
 
-    They are of one observation and were fitted without a pattern. The result is shifted by less
-    than a pixel and has `first_pixel`; it is None if the pattern is not detected.
+    The frames are of one observation and were fitted without a pattern. The result is shifted by
+    less than a pixel and has `first_pixel`; it is None if the pattern is not detected.
     """
     frame, (measured,) = fit.frames[0], measure_patterns(fit)
     observation = frame.observation
     if pattern.first_pixel is None:
         return None
     # Stars behind the same mask are within a few pixels of each other on the detector, so the
-    # pattern is first put where its star is on that of the frame, to whole pixels. The search then
-    # moves it by up to `_REACH` pixels in steps, and about the best place in finer ones.
+    # pattern is first put with its star on the frame's star, to whole pixels. The search then moves
+    # it by up to `_REACH` pixels in steps, and about the best place in finer ones.
     start = np.round(np.subtract(measured.center, pattern.center)).astype(int)
     column, row = np.subtract(pattern.first_pixel, start).tolist()
     expected = pattern.at(replace(observation, first_pixel=(column, row)))[0]
     y, x = np.indices(expected.shape)
     scale_x, scale_y = frame.model.detector.pixelscale
     distance = np.hypot((x - measured.center[0]) * scale_x, (y - measured.center[1]) * scale_y)
-    # Inverse variances of the ratio: that of its noise, and that of the errors of the model.
+    # Inverse variances of the ratio, from its noise and from the errors of the model.
     weight = np.where(distance > _INNER, 1 / (measured.variance + _MODEL_ERROR**2), 0.0)
     steps = np.arange(-_REACH, _REACH + _COARSE / 2, _COARSE)
     coarse = _correlation(measured.value, expected, weight, steps, steps)
@@ -158,9 +158,9 @@ _ROUGH: dict[str, Any] = {
     "adapt_prior": False,
     "companions_if_stalled": False,
 }
-"""Changes to the settings of a fit that only tells which pixels a frame shows, which the pattern
-does as soon as it dominates the residual. In thirteen frames of four stars, places differed by at
-most 0.05 pixel from those of the headers or of full fits."""
+"""Changes to the settings of a fit that only tells which pixels a frame shows. The pattern tells it
+as soon as it dominates the residual: in thirteen frames of four stars, places differed by at most
+0.05 pixel from the headers or from full fits."""
 
 _TURNED = 1.0
 """Degrees between rolls from which they tell a planet from the pattern: a pixel at 3.6 arcsec."""
@@ -179,17 +179,17 @@ class PatternChoice:
     # pixels they have.
     science: tuple[Observation, ...]
     systematics: Systematics | None
-    # Of the target's fit.
+    # Settings of the target's fit.
     settings: GaussNewton | None
     # One fit for each reference star that was fitted.
     references: tuple[Refinement, ...] = ()
     # Reference stars that could not be fitted, and why.
     failed: tuple[tuple[str, str], ...] = ()
-    # Nowhere ("none"), because none is known or ("off") none was wanted; from the caller, from
-    # libraries alone, from reference stars (and the library), or from the rolls, which share a
-    # pattern of which only the size is known.
+    # Where the pattern is from: nowhere, because none is known ("none") or none was wanted ("off"),
+    # the caller, libraries alone, reference stars (and the library), or the rolls, which share a
+    # pattern whose size alone is known.
     origin: Origin = "none"
-    # The one that was searched.
+    # The library that was searched.
     library: PatternLibrary = field(default_factory=PatternLibrary)
 
     @property
@@ -210,8 +210,8 @@ class PatternChoice:
     def of_other_flat_field(self) -> Observation | None:
         """The first frame that was calibrated with another flat field than the pattern's, if any.
 
-        It may show the pattern nevertheless. For a library's pattern, a frame that does not say its
-        flat field is one, too.
+        The frame may show the pattern nevertheless. For a library's pattern, a frame that does not
+        state its flat field counts as well.
         """
         if self.origin == "library":
             known = {each.flat for each in self.library.matching(self.science[0])}
@@ -223,9 +223,10 @@ class PatternChoice:
         return None
 
     def is_refuted_by(self, fit: Refinement) -> bool:
-        """Whether a fit shows less than half of a library's pattern; for any, the log warns.
+        """Whether a fit shows less than half of a library's pattern.
 
-        Raises IncompatibleSetupError for a pattern that was given.
+        The log warns if a fit shows less than half of any pattern. Raises IncompatibleSetupError if
+        that pattern was given.
         """
         if not lacks_pattern(fit):
             return False
@@ -242,7 +243,7 @@ class PatternChoice:
 
 
 def as_request(systematics: object) -> PatternRequest:
-    """Make a request for a pattern; paths are those of files, or of a folder of libraries.
+    """Make a request for a pattern; paths lead to files, or to a folder of libraries.
 
     Raises IncompatibleSetupError for anything else, CorruptFileError for a file without a pattern.
     """
@@ -289,7 +290,7 @@ def choose_systematics(
     fits them in any case and uses both. Their fits start from `map_for` their date, by default from
     `opd`. `library` is False for frames that do not show its pattern.
     Raises DiffrenderError if frames that have to be moved cannot be fitted; a reference star that
-    cannot be is left out.
+    cannot be fitted is left out.
     """
     systematics = as_request(systematics)
     common: dict[str, Any] = {
@@ -314,8 +315,8 @@ def choose_systematics(
     if systematics != "off" and not isinstance(systematics, Systematics):
         first = science[0]
         known = _library(systematics) if library else PatternLibrary()
-        # In this order: the pattern of the library; that of reference stars, whose fits take time;
-        # and that of the rolls, of which only the size is known.
+        # In this order: the library's pattern; the reference stars' pattern, whose fits take time;
+        # and the rolls' pattern, whose size alone is known.
         if systematics != "references" and library:
             pattern = known_systematics(first, library=known)
             if pattern is not None:
@@ -345,10 +346,10 @@ def choose_systematics(
 def pattern_for_visit(
     choice: PatternChoice, science: Sequence[Observation], references: Sequence[Observation]
 ) -> Systematics | None:
-    """The pattern for a fit of all frames of a visit; `choice` is that of the target's own fit."""
+    """The pattern for a fit of all frames of a visit, after the `choice` for the target's fit."""
     # A pattern that was learned from one of the fitted stars would count its frames twice: the
-    # pattern of other stars is taken, or else one of unknown values that frames of the same pixels
-    # share.
+    # pattern of other stars is taken, or else a pattern of unknown values that frames of the same
+    # pixels share.
     given = choice.systematics if choice.origin == "given" else None
     if choice.origin == "off" or (
         given is not None and not any(shows_star(given, each) for each in references)
@@ -370,12 +371,12 @@ def pattern_for_visit(
 
 
 def is_known_beside(choice: PatternChoice, references: Sequence[Observation]) -> bool:
-    """Whether the pattern of a choice is that of other frames than these of reference stars."""
+    """Whether a choice has a pattern of other frames than these frames of reference stars."""
     return choice.origin == "library" or bool(_fits_beside(choice, references))
 
 
 def _fits_beside(choice: PatternChoice, references: Sequence[Observation]) -> list[Refinement]:
-    """Fits of reference stars that taught a pattern, of other frames than these."""
+    """Fits of reference stars that the pattern was learned from, except of these frames."""
     if choice.origin != "references":
         return []
     names = {each.name for each in references}
@@ -392,7 +393,7 @@ def with_known_pattern(settings: GaussNewton) -> GaussNewton:
 
 
 def _library(systematics: PatternLibrary | str) -> PatternLibrary:
-    """The package's library, after that of the request if it has one."""
+    """The package's library, preceded by a library in the request."""
     if isinstance(systematics, PatternLibrary):
         return combine_libraries([systematics, package_library()])
     return package_library()
@@ -408,7 +409,7 @@ def _limited(
 
 
 def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
-    """Return a pattern of which only the size is known, if rolls tell it from a planet."""
+    """Return a pattern whose size alone is known, if rolls tell it from a planet."""
     first = science[0]
     same = all(_alike(each, first) for each in science)
     # Files of one roll, such as the segments of an exposure, show a planet on the same pixels.
@@ -486,7 +487,7 @@ def _registered(
     opd: OPDMap,
     common: dict[str, Any],
 ) -> tuple[Sequence[Observation], Systematics | None]:
-    """Move frames onto the pixels of the library's pattern; no pattern if one cannot be."""
+    """Move frames onto the pixels of the library's pattern; no pattern if this fails for one."""
     moved = []
     for each in science:
         frame: Observation | None = each
@@ -555,9 +556,9 @@ def fit_with_pattern(
 ) -> tuple[PatternChoice, Refinement]:
     """Choose a pattern and fit the target; once more without the library if it is refuted.
 
-    `fit` fits with a choice; its second argument is True without the library. `options` are those
-    of `choose_systematics`, of which this also raises the errors, and IncompatibleSetupError for a
-    pattern that was given and is refuted. The choice is that of the last fit.
+    `fit` fits with a choice; its second argument is True without the library. `options` go to
+    `choose_systematics`. Returns the last fit and its choice. Raises what `choose_systematics`
+    raises, and IncompatibleSetupError for a pattern that was given and is refuted.
     """
     # Only a fit can tell that frames which were calibrated with another flat field do not have the
     # known pattern. Where the headers make that likely, one of these frames is asked before all are

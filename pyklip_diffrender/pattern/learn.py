@@ -52,13 +52,13 @@ _log = logging.getLogger(__name__)
 Files = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 _Fit = tuple[Refinement, tuple[float, float]]
-"""A fit, and how much of its pattern the frames show with the error of that."""
+"""A fit, and the size of its pattern in the frames with the error of the size."""
 
 _ALONE = 0.01
 """Smallest model error, as a fraction of the star, in the fit of a star without a pattern."""
 
 _KNOWN = 0.002
-"""Smallest model error with the pattern of the other stars, whose own error is counted apart."""
+"""Smallest model error with the pattern of other stars; the pattern's error is counted apart."""
 
 
 def learn_library(
@@ -94,15 +94,15 @@ def learn_library(
         The wavefront to start from, as for `reduce`; a function gets the `Sequence` of a star and
         returns its `OPDMap`.
     stars, filters : sequence of str
-        Names of those to use; default all.
+        Names of the stars and filters to use; default all.
     size : int
         Side in pixels of the square about the star that is fitted, and for which the library has
         the pattern.
     settings : GaussNewton, optional
-        Of the fits; default those of `refine`. The model error is replaced.
+        Fit settings; default as in `refine`. The model error is replaced.
     folder : path, optional
-        Where finished fits are kept. A run with the same frames, headers, map and settings takes
-        them from there, and one with further stars fits those.
+        Folder for finished fits. A run with the same frames, headers, map and settings takes the
+        fits from there, and fits only further stars.
     device : str
         PyTorch device of the optical model.
     progress : bool
@@ -111,18 +111,18 @@ def learn_library(
     Returns
     -------
     PatternLibrary
-        Its `validation` has for each star and epoch the set-up, the date, the number of `frames`,
-        chi-squared per pixel without a pattern (`chi2_alone`) and with that of the other stars
-        (`chi2_with_others`), both with the noise of the data alone, and how much of that pattern
-        the frames show with its error (`shown`, `shown_error`, see `pattern_size`). The latter
-        three are NaN for a star without others.
+        The library. Its `validation` has for each star and epoch the set-up, the date, the number
+        of `frames`, chi-squared per pixel without a pattern (`chi2_alone`) and with the pattern of
+        the other stars (`chi2_with_others`), both with the noise of the data alone, and how much of
+        that pattern the frames show with its error (`shown`, `shown_error`, see `pattern_size`).
+        `chi2_with_others`, `shown` and `shown_error` are NaN for a star without others.
 
     Raises
     ------
     NoValidPixelsError
         If no star is left.
     IncompatibleSetupError
-        For stars or filters that are not there.
+        For stars or filters that the files do not have.
     RefinementError
         If no star can be fitted.
 
@@ -220,7 +220,7 @@ class _Fitter:
                 progress=self.progress,
             )
         if path is not None:
-            # With the linear model only where something is measured with it.
+            # The linear model is kept only where something is measured with it.
             fit.write(path, linear=known is not None, overwrite=True)
         return fit, _shown(fit)
 
@@ -311,7 +311,7 @@ def _is_called(name: str, star: str, frames: Iterable[FrameFile]) -> bool:
 
 
 def _of_setup(star: str, files: Sequence[FrameFile], opd: Any, size: int) -> Iterable[_Epoch]:
-    """Epochs of a star with one set-up; those that cannot be used are named in the log."""
+    """Epochs of a star with one set-up; the log names the epochs that cannot be used."""
     try:
         sequences = FrameSequence.by_epoch([each.path for each in files], target=star)
     except DiffrenderError as error:

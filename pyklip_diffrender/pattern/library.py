@@ -49,10 +49,10 @@ from pyklip_diffrender.scene.systematics import (
 )
 
 _SETUP = {"filter", "mask", "detector"}
-"""What both a pattern of a library and the frames that it is for must state."""
+"""Properties that both a pattern of a library and the frames that it is for must state."""
 
 _VERSION = 2
-"""Of the layout of the files, in the card PATVERS."""
+"""Version of the layout of the files, in the card PATVERS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +90,10 @@ class PatternLibrary:
     def matching(self, observation: Observation) -> list[MeasuredPattern]:
         """Return the patterns that an observation may show.
 
-        They are of the detector, mask and filter of the observation, cover at least half of its
-        pixels, and are of other stars, so that nothing of the target's planets is among them. They
-        share one flat field: that of the observation if there are such, else the one of most
-        patterns.
+        The patterns have the detector, mask and filter of the observation, cover at least half of
+        its pixels, and are of other stars, so that nothing of the target's planets is among them.
+        They share one flat field: the observation's if there are such patterns, else the flat field
+        of most patterns.
         """
         chosen = [
             pattern
@@ -169,7 +169,7 @@ class PatternLibrary:
 def combine_libraries(libraries: Iterable[PatternLibrary]) -> PatternLibrary:
     """Put the patterns of several libraries into one.
 
-    Of a frame that is in several of them, the pattern of the first one is kept.
+    For a frame in several libraries, the pattern of the first library is kept.
 
     Examples
     --------
@@ -194,13 +194,13 @@ def known_systematics(
     *,
     library: bool | PatternLibrary = True,
 ) -> Systematics | None:
-    """Combine the flat-field pattern of reference stars and that of a library.
+    """Combine the flat-field patterns of reference stars and of a library.
 
     Parameters
     ----------
     observation : Observation
-        Frames that it is for. Patterns of the same star are left out, so that nothing of its
-        planets is in the pattern.
+        Frames that the pattern is for. Patterns of the same star are left out, so that nothing of
+        its planets is in the pattern.
     references : Refinement or sequence of Refinement
         Fits of reference stars, if there are any.
     library : bool or PatternLibrary
@@ -209,7 +209,7 @@ def known_systematics(
     Returns
     -------
     Systematics or None
-        None if there are fewer than two frames to learn from.
+        The pattern; None if there are fewer than two frames to learn from.
 
     Examples
     --------
@@ -244,7 +244,7 @@ def known_systematics(
 def _flat_for(patterns: Sequence[MeasuredPattern], observation: Observation) -> str | None:
     """The flat field of an observation if one of the patterns has it, else the most frequent one.
 
-    Patterns are errors of one flat field: those of several must not be averaged.
+    Patterns are errors of one flat field: patterns of several must not be averaged.
     """
     flats = Counter(pattern.flat for pattern in patterns)
     own = flat_of(observation)
@@ -266,7 +266,7 @@ def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
 
 
 def _identity(pattern: MeasuredPattern) -> tuple[object, ...]:
-    """The frame that a pattern was measured in, and the flat field it was calibrated with."""
+    """Frame in which a pattern was measured, and the flat field of the frame's calibration."""
     name = unpacked_name(pattern.frame)
     return (name or id(pattern), pattern.date, pattern.filter, pattern.detector, pattern.flat)
 
@@ -295,7 +295,7 @@ def _hdus(pattern: MeasuredPattern, number: int) -> list[fits.ImageHDU]:
     if star.motion is not None:
         header["MU_RA"], header["MU_DEC"] = star.motion
     if star.epochs and not star.pointing:
-        # The other one is the date of the frame.
+        # DATE-OBS is the date of the frame.
         header["MU_EPOCH"] = star.epochs[0]
     header["FRAME"], header["DATE-BEG"] = fits_text(pattern.frame), pattern.date
     if pattern.light is not None:

@@ -34,14 +34,14 @@ _RING = 4.0
 """Width in pixels of the rings in which scatters are estimated."""
 
 _FIRST_RING = 2
-"""First ring from which the pedestal is estimated: closer to the star, residuals are
-also those of the wavefront."""
+"""First ring from which the pedestal is estimated: closer to the star, the wavefront has residuals
+as well."""
 
 FEW_PIXELS = 50
 """Number of pixels below which no scatter is estimated in a ring."""
 
 _RING_TO_RING = 0.2
-"""Relative error of a ring's mean product, because the pattern is not the same in all of them."""
+"""Relative error of a ring's mean product, because the pattern is not the same in all rings."""
 
 _DIFFERENT = 1.5
 """Ratio of the brightness of two stars from which their residuals tell the pedestal."""
@@ -65,7 +65,7 @@ class _Pair(NamedTuple):
 def pattern_pedestal(fits: Sequence[Refinement]) -> float:
     """The pedestal, in the frames' unit, with which one pattern holds near the star and far away.
 
-    It is 0 where no two frames of a fit show the same pixels.
+    The pedestal is 0 where no two frames of a fit show the same pixels.
     """
     # Frames have a fixed pattern m that does not become fainter with the distance from the star. In
     # frames of two stars s of different brightness the residuals of a pixel are r = m (s + B), so
@@ -197,11 +197,11 @@ _HALF = 0.5
 """Size below which more of the pattern would remain with it than without it."""
 
 _SURE = 2.0
-"""Standard deviations by which the size must be below that."""
+"""Standard deviations by which the size must be below `_HALF`."""
 
 
 def pattern_size(fit: Refinement) -> tuple[float, float] | None:
-    """Measure how large the known pattern is in the frames, and the error of that.
+    """Measure the size of the known pattern in the frames, and the error of the size.
 
     The size is 1 if the frames show what ``Systematics.pattern`` says, and 0 if they show nothing
     of it. All unknowns of the fit are marginalised, as well as the error of the pattern.
@@ -213,7 +213,8 @@ def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     Returns
     -------
     tuple of float, or None
-        None for a fit without a pattern whose values are known, or without a linear model.
+        Size and error; None for a fit without a pattern whose values are known, or without a linear
+        model.
 
     Examples
     --------
@@ -238,8 +239,8 @@ def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     """
     if fit.systematics is None:
         return None
-    # The residual of a fit with the pattern m is (size - 1) m (s + B): its amplitude and error are
-    # those of a template, marginalised over the unknowns.
+    # The residual of a fit with the pattern m is (size - 1) m (s + B): it is fitted as a template,
+    # marginalised over the unknowns.
     templates = {}
     for k, frame in enumerate(fit.frames):
         light = light_and_residual(frame)[0] + frame.pedestal
@@ -272,7 +273,7 @@ def lacks_pattern(fit: Refinement) -> bool:
 _ASPECTS = {
     "filter": "filter", "image_mask": "mask", "detector": "detector", "flat": "flat field (R_FLAT)",
 }  # fmt: skip
-"""Properties that patterns share which are averaged, by the names of their attributes."""
+"""Properties that averaged patterns share, by the names of their attributes."""
 
 _SMOOTH = 1.0
 """Rings (standard deviation) over which the scatter between frames is averaged."""
@@ -285,20 +286,20 @@ class MeasuredPattern:
     star: str
     # (ny, nx), residual over the sum of star and pedestal; 0 where not known.
     value: Image
-    # (ny, nx), of the data's noise; inf where not known.
+    # (ny, nx), variance by the data's noise; inf where not known.
     variance: Image
     # x, y of the star, 0-indexed pixels.
     center: tuple[float, float]
-    # Column and row of the first pixel on the full detector, as of an `Observation`.
+    # Column and row of the first pixel on the full detector, as in an `Observation`.
     first_pixel: tuple[int, int] | None = None
     filter: str | None = None
     image_mask: str | None = None
-    # Where and when it was measured.
+    # Where and when the pattern was measured.
     frame: str = ""
     date: str = ""
-    # As of `Systematics`, in the unit of the frame.
+    # The pedestal as in `Systematics`, in the unit of the frame.
     pedestal: float = 0.0
-    # As headers name it, such as NRCALONG.
+    # The detector as headers name it, such as NRCALONG.
     detector: str | None = None
     # Name of the flat field with which the frame was calibrated (R_FLAT).
     flat: str | None = None
@@ -315,13 +316,14 @@ class MeasuredPattern:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frame, as of several."""
+        """The frame, as a tuple."""
         return (self.frame,) if self.frame else ()
 
     def with_pedestal(self, pedestal: float) -> MeasuredPattern:
         """Return the pattern as a fraction of the sum of the star and another pedestal.
 
-        Raises IncompatibleSetupError for another one than its own if its star was not kept.
+        Raises IncompatibleSetupError for another pedestal than the pattern's if its star was not
+        kept.
         """
         if pedestal == self.pedestal:
             return self
@@ -349,17 +351,17 @@ def learn_systematics(
 ) -> Systematics:
     """Learn the pattern that the star model misses from fits of other stars.
 
-    In every frame the residual is divided by the sum of the star and a pedestal, the same in all of
-    them, see `pattern_pedestal`. The ratios are averaged with inverse
-    variances, which are those of the data's noise and of the scatter between frames beyond that
-    noise; a zero-mean Gaussian prior, as wide as the ratios scatter over the pixels of a ring,
-    shrinks pixels that were not measured well. The error of the pattern for another frame is that
-    of this average and the scatter between frames.
+    In every frame the residual is divided by the sum of the star and a pedestal, the same in all
+    frames, see `pattern_pedestal`. The ratios are averaged with inverse variances, from the data's
+    noise and the scatter between frames beyond that noise; a zero-mean Gaussian prior, as wide as
+    the ratios scatter over the pixels of a ring, shrinks pixels that were not measured well. The
+    error of the pattern for another frame combines the error of this average and the scatter
+    between frames.
 
     Parameters
     ----------
     fits : Refinement or sequence of Refinement
-        Of other stars than the one that the pattern will be used for: a planet of the target
+        Fits of other stars than the star that the pattern will be used for: a planet of the target
         would be learned as well. Two frames at least; rolls of one star will do, several stars
         show better how well the pattern carries over.
     name : str, optional
@@ -398,7 +400,7 @@ def measure_patterns(
 ) -> list[MeasuredPattern]:
     """Measure the pattern in every frame of the fits that did not fail.
 
-    The pedestal, as of `Systematics` in the unit of the frames, is estimated by default.
+    The pedestal, as in `Systematics` and in the unit of the frames, is estimated by default.
     """
     several = [fits] if isinstance(fits, Refinement) else list(fits)
     usable = [fit for fit in several if fit.status.usable]
@@ -411,7 +413,7 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
     """Average measured patterns, see `learn_systematics`, with one pedestal (`common_pedestal`).
 
     Raises IncompatibleSetupError for patterns of several filters, masks, detectors or flat fields,
-    or of none, and if the pedestals differ of patterns whose stars were not kept.
+    or of none, and if patterns whose stars were not kept have different pedestals.
     """
     setup: dict[str, str | None] = {}
     for aspect in ("filter", "image_mask", "detector", "flat"):
@@ -421,7 +423,7 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
                 f"systematics: got patterns of {sorted(map(str, stated))}, expected one "
                 f"{_ASPECTS[aspect]}"
             )
-        # What some do not state is not known of all.
+        # What some patterns do not state is not known of all.
         setup[aspect] = stated.pop() if len(stated) == 1 else None
     pedestal = common_pedestal(patterns)
     patterns = [pattern.with_pedestal(pedestal) for pattern in patterns]
@@ -540,7 +542,7 @@ def _scatter_between_frames(
     values: Image, variances: Image, stars: Sequence[str], away: Image
 ) -> Image:
     """Standard deviation (ny, nx) of the ratio between frames beyond their noise."""
-    # Frames of different stars, where there are any: those of one star share what is particular to
+    # Frames of different stars, where there are any: frames of one star share what is particular to
     # it. var(v_a - v_b) = noise_a + noise_b + 2 scatter^2. The error of a variance is in proportion
     # to it, hence the weights 1 / noise^2. In a single ring it is so uncertain that the difference
     # may be negative, so neighbouring rings are averaged.

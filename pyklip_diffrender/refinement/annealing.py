@@ -63,10 +63,10 @@ class Course:
     """Where a fit is in its schedule."""
 
     state: State
-    best: State  # Of the least model error.
-    aligned: State  # The one that ended the alignment.
+    best: State  # The state of the least model error.
+    aligned: State  # The state at the end of the alignment.
     carried: StepState  # What the last step hands on to the next one.
-    # Those of the fit, with the size of the drift between frames once it is measured.
+    # Settings of the fit, with the size of the drift between frames once it is measured.
     settings: GaussNewton
     kappa: float  # Model error that the next step assumes.
     modes: int  # Number of leading wavefront modes that are free; 0 for the alignment.
@@ -121,12 +121,12 @@ def conclude(
 ) -> Refinement:
     """Compute errors about a final state, and make the result; `about` has history and duration.
 
-    Settings and priors are those of the final state. The errors include the model error `kappa`.
+    Settings and priors are the final ones. The errors include the model error `kappa`.
     """
     problems = [forward.problem for forward in solver.objective.forwards]
     modes = len(solver.basis) if settings.wavefront else 0
-    # Robust weights take a source that is not in the model for an outlier, and a tenth of the light
-    # of one of S/N 7 with it.
+    # Robust weights take a source that is not in the model for an outlier: a source of S/N 7 loses
+    # a tenth of its light.
     robust = solver.objective.robust if kappa else math.inf
     linear = solver.linear_model(state, priors, kappa, modes, robust)
     update = solver.posterior(state, priors)
@@ -206,7 +206,7 @@ planet of contrast 1e-4 at 0.3 arcsec were mistaken for planets at 0.005 to 0.1.
 """
 
 _BRIGHT = 8.0
-"""S/N of a companion, in units of the scatter, that is added when the fit of the wavefront stalls.
+"""S/N, in units of the scatter, above which a companion is added when the wavefront's fit stalls.
 
 Without companions, peaks reached 6 (drifts of 40 to 400 h). Companions that stalled a fit had 12.
 """
@@ -222,11 +222,11 @@ _HOPELESS = 0.12
 disk of AU Mic leaves 0.11 at most, and ten neighbours up to 8e-4 of the star's flux 0.15 to 0.3."""
 
 _FAINT = 5.0
-"""S/N of a companion below which the last steps of a fit do without it, that of a candidate. Errors
-of the wavefront had less than 1 in real frames."""
+"""S/N below which the last steps of a fit leave out a companion; candidates have as much. Errors
+of the wavefront had an S/N below 1 in real frames."""
 
 _MOST_BRIGHT = 20
-"""Largest number of companions that a fit may add in this way."""
+"""Largest number of bright companions that a fit may add."""
 
 _ALIGNED = 0.05
 """Gain in chi-squared per pixel below which the wavefront is fitted as well."""
@@ -235,12 +235,12 @@ _OUTSHONE = 1.0
 """Model error, as a fraction of the star, from which something may outshine the star."""
 
 _STALLED = 0.01
-"""Gain in chi-squared per pixel of a step below which bad pixels are looked for. One that is not
-flagged can keep the model error at 3 %, and the fit would take six more steps that gain nothing."""
+"""Gain of a step in chi-squared per pixel below which bad pixels are looked for. An unflagged bad
+pixel can keep the model error at 3 %, and the fit would take six more steps that gain nothing."""
 
 _SPOILED = 0.01
-"""Model error without bad pixels from which a fit that had them goes back to the alignment, if they
-made more than half of its chi-squared."""
+"""Model error from which a fit goes back to the alignment after bad pixels were left out, if these
+pixels made more than half of chi-squared."""
 
 _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
@@ -283,15 +283,15 @@ of the drift between frames are measured for the first time."""
 
 _DRIFT_STEPS = 2
 _SAME_DRIFT = 0.25
-"""Largest number of steps after the size of the drift is measured for the last time, and relative
-change of it that takes none."""
+"""Largest number of steps after the last measurement of the drift's size, and relative change of
+the size that needs no step."""
 
 
 @dataclass(frozen=True)
 class _Fitted:
-    """Where a fit has ended: its state, what its last step carries, and the settings it ended with.
+    """The end of a fit: its state, what its last step carries, and its settings.
 
-    The settings have other priors than those of the fit where the data have changed these.
+    The priors in the settings differ from the priors at the start where the data changed them.
     """
 
     state: State
@@ -319,7 +319,7 @@ class Annealing:
     """One fit with a given basis.
 
     `warm` has the final values of an earlier fit; the wavefront is then free from the first step.
-    `earlier` is that fit if it was one of the same frames, whose derivatives are used again.
+    `earlier` is that fit if it had the same frames; its derivatives are then used again.
     """
 
     def __init__(
@@ -382,7 +382,7 @@ class Annealing:
 
     @staticmethod
     def _end_of(course: Course) -> _Fitted:
-        """The present end of a fit, if it were to end."""
+        """The end of a fit, if it were to end now."""
         return _Fitted(course.state, course.carried, course.settings)
 
     def _beginning(self) -> Course:
@@ -391,7 +391,7 @@ class Annealing:
         state, carried = self._with_dominant(self._begin, self._first)
         kappa = max(self.objective.model_error(state), settings.min_model_error)
         if self._is_warm and settings.min_model_error:
-            # A larger one would lead away from the solution, and back.
+            # A larger kappa would lead away from the solution, and back.
             kappa = settings.min_model_error
         skips_alignment = settings.wavefront and (not settings.free or self._is_warm)
         modes = self._modes_for(kappa) if skips_alignment else 0
@@ -457,7 +457,7 @@ class Annealing:
             course.outlier_searches = 0
             return
         course.least, course.error = NOTHING, self.objective.model_error(course.state)
-        # A very bad pixel has the wavefront fitted to itself.
+        # The wavefront was fitted to a very bad pixel.
         fewer = self.objective.chi2_per_pixel(course.state) < course.chi2 / 2
         if fewer and course.error > _SPOILED:
             self._back_to_alignment(course, course.aligned)
@@ -493,7 +493,7 @@ class Annealing:
     def _drop_faint(self, course: Course) -> bool:
         """Go on without companions of the alignment that were errors of the wavefront.
 
-        They would double the time of every step. The search finds a faint source without them.
+        Faint companions would double the time of every step, and the search finds them anyway.
         """
         is_close = course.error <= max(_NEAR, self.settings.min_model_error)
         first, present = (
@@ -550,7 +550,7 @@ class Annealing:
         return end
 
     def _widened(self, end: _Fitted) -> GaussNewton:
-        """Settings with a prior of the highest evidence; those of `end` unless it is wider."""
+        """Settings with the prior of highest evidence if wider, else the settings of `end`."""
         settings, priors = end.settings, end.carried.priors
         if self.objective.chi2_per_pixel(end.state) > _FOREIGN:
             return settings
@@ -605,7 +605,7 @@ class Annealing:
         return end
 
     def _narrowed(self, end: _Fitted) -> GaussNewton:
-        """Settings with a prior of the highest evidence; those of `end` unless it is narrower."""
+        """Settings with the prior of highest evidence if narrower, else the settings of `end`."""
         # The most probable wavefront and flux are found together. Where the prior is too wide, the
         # likelihood leaves the wavefront free to be smaller, which the prior favours, and the flux
         # of the star comes out too high. Without a map, only the product of the flux and the square
@@ -620,8 +620,8 @@ class Annealing:
         size = priors.size(update)
         if size > _NARROW:
             return settings
-        # The logarithm of the size is nearly linear in that of the prior's scale, so that the last
-        # two solutions say where it is 0 (secant method).
+        # The logarithm of the size is nearly linear in the logarithm of the prior's scale, so that
+        # the last two solutions say where it is 0 (secant method).
         log_size, slope = math.log(size), 1.0
         for _ in range(_SOLUTIONS):
             change = log_size / slope
@@ -644,7 +644,7 @@ class Annealing:
         return self._gone_on(end, _DRIFT_STEPS) if is_other else end
 
     def _with_drift_of(self, end: _Fitted) -> tuple[_Fitted, bool]:
-        """Set the size of the drift to that of the highest evidence; False if it hardly changes."""
+        """Give the drift the size of highest evidence; False if the size hardly changes."""
         before = end.carried.priors
         if not before.drift:
             return end, False
@@ -669,7 +669,7 @@ class Annealing:
     def _posterior(self, end: _Fitted) -> EvidenceUpdate:
         """Errors of all unknowns, with the weights of all pixels.
 
-        They include a model error where the noise does not explain the data.
+        The errors include a model error where the noise does not explain the data.
         """
         priors, kappa = end.carried.priors, self._unexplained(end.state)
         self.solver.linear_model(end.state, priors, kappa, self._all_modes, math.inf, final=False)
@@ -706,14 +706,14 @@ class Annealing:
     def _leave_out_outliers(self, end: _Fitted, modes: int) -> bool:
         """Leave out bad pixels that stand alone; False if there are none.
 
-        The first `modes` modes of the wavefront are those that the fit has adapted.
+        The fit has adapted the first `modes` modes of the wavefront.
         """
         state, priors = end.state, end.carried.priors
         for k in range(_SEARCHES):
             kappa = self._unexplained(state)
             linear = self.solver.linear_model(state, priors, kappa, modes, math.inf, final=False)
             outliers = isolated_outliers(self.objective, state, linear)
-            del linear  # The next one is as large.
+            del linear  # The next linear model is as large.
             if not any(bool(each.any()) for each in outliers):
                 return k > 0
             self.solver.leave_out(outliers)

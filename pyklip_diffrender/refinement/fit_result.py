@@ -97,9 +97,9 @@ class Status(Enum):
     def calibrated(self) -> bool:
         """Whether the fit converged to a model that explains the data.
 
-        The errors of the fit then need no factor. `detect` still multiplies those of sources in
-        real frames by the scatter of the S/N, because neighbouring pixels share errors of the model
-        that chi-squared does not show.
+        The errors of the fit then need no factor. `detect` still multiplies the errors of sources
+        in real frames by the scatter of the S/N, because neighbouring pixels share errors of the
+        model that chi-squared does not show.
         """
         return self is Status.CONVERGED
 
@@ -239,12 +239,12 @@ class FrameFit:
         background : bool
             Add the fitted background.
         source : (x, y), optional
-            Render a source of the star's flux here instead, arcsec from the model's axis.
+            Place of a source of the star's flux to render instead, arcsec from the model's axis.
 
         Returns
         -------
         ndarray, (ny, nx)
-            In the unit of the observation, without the flat-field pattern.
+            Image in the unit of the observation, without the flat-field pattern.
         """
         model, values = self.on_pixels(fov_pixels, center)
         if source is not None:
@@ -261,8 +261,8 @@ class FrameFit:
     ) -> tuple[OpticalSystem, dict[str, Tensor]]:
         """Return the model on another array of pixels, and its parameters; see `render`.
 
-        Where the image of the model's pupil samples would repeat in a larger array, it has more,
-        see `opd_for`.
+        The model has more pupil samples where its image would repeat in a larger array, see
+        `opd_for`.
         """
         model = self.model
         if fov_pixels is not None and fov_pixels != self.model.detector.shape:
@@ -396,7 +396,7 @@ class Refinement:
         Wavefront modes that were fitted.
     status : Status
     chi2_per_pixel : float
-        With the errors of the observations (and those of `systematics`).
+        Chi-squared per pixel, with the errors of the observations and of `systematics`.
     model_error : float
         Assumed error of the star model, as a fraction of the star's light in a pixel, added in
         quadrature to the noise; 0 if chi-squared per pixel is near 1.
@@ -422,9 +422,9 @@ class Refinement:
         One entry for each iteration.
     seconds : float
     catalogue_error : float or None
-        Relative error of the star's flux if a catalogue has stated it, see `star_flux_error`.
+        Relative error of the star's flux in a catalogue, see `star_flux_error`; None without one.
     catalogue_flux : float or None
-        That flux density, Jy, which the star has within 0.5 %.
+        Flux density of the star in that catalogue, Jy, to which the fit agrees within 0.5 %.
 
     Examples
     --------
@@ -499,7 +499,8 @@ class Refinement:
     def wavefront(self) -> Image:
         """The refined wavefront of the first frame, (npix, npix), m, real; see `absorption`.
 
-        It is on the samples of the model's pupil. Both together are ``frames[0].opd``.
+        It is on the samples of the model's pupil. Together with the absorption, it is
+        ``frames[0].opd``.
         """
         return np.array(np.real(self.frames[0].opd))
 
@@ -528,7 +529,7 @@ class Refinement:
         Raises
         ------
         IncompatibleSetupError
-            If the fit was read from a file without them.
+            If the fit was read from a file without its linear model.
         """
         if self.stored_linear is None:
             raise IncompatibleSetupError(
@@ -569,7 +570,7 @@ class Refinement:
     def parameters(self) -> QTable:
         """All parameters but the wavefront: frame, name, value, error, unit and description.
 
-        The unit of flux, background and pedestal is that of the frame.
+        Flux, background and pedestal are in the unit of the frame.
         """
         return parameter_table(self.frames)
 
@@ -689,7 +690,7 @@ class Refinement:
         Parameters
         ----------
         ax : three Axes, optional
-            Default those of a new figure.
+            Default: the axes of a new figure.
         frame : int
             Which of `frames`; the integrations of an observation are averaged.
 

@@ -50,12 +50,12 @@ _STRUCTURE = 1.15
 """Reduced chi-squared above which a fit is repeated with more modes."""
 
 _FEWEST_CYCLES = 24.0
-"""Highest spatial frequency of the modes of settings that name none, and do not fit them."""
+"""Highest spatial frequency of the modes if the settings name none, as without a wavefront."""
 
 _FINER = 3e-3
-"""`GaussNewton.tolerance` with which a fit goes on that had a larger one, as a first look has, and
-does not explain its data. From a map three months old, it ends where it nearly explains those of
-HIP 17695, and limits are 1.1 times higher."""
+"""`GaussNewton.tolerance` for continuing a fit with a larger tolerance, such as a first look, that
+does not explain its data. From a map three months old, the fit ends where it nearly explains the
+data of HIP 17695, and limits are 1.1 times higher."""
 
 _FOREIGN = 5.0
 """Reduced chi-squared above which more modes would not help, because the frame shows more than the
@@ -65,7 +65,7 @@ star."""
 def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Unknown, float]]:
     """Return the settings, and the starting values, with which to continue a fit.
 
-    The prior has the final scales of the fit, and the companions are those of the fit; `changes`
+    The prior has the final scales of the fit, and the companions are its final ones; `changes`
     are other fields of `GaussNewton`. Raises `IncompatibleSetupError` if the fit was read from a
     file without its linear model.
     """
@@ -82,7 +82,7 @@ def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Un
 
 
 def _with_scales(prior: WavefrontPrior, scales: Mapping[str, float], label: str) -> WavefrontPrior:
-    """Replace the scales of a prior by those of a fit; other groups keep theirs."""
+    """Replace scales of a prior by the fitted `scales`; other groups keep their scale."""
     return replace(
         prior, scales={n: scales.get(label.format(n), scale) for n, scale in prior.scales.items()}
     )
@@ -98,9 +98,8 @@ def fit_in_stages(
 ) -> Refinement:
     """Refine with the basis of the settings, or the first default basis that explains the data.
 
-    `problems` has one for each frame, and `warm` starting values. Derivatives of a fit of the
-    `same_frames` are used again. The `cycles` of the result's settings begin with those of the last
-    basis.
+    `problems` has one entry per frame, and `warm` the starting values. Derivatives of a fit of the
+    `same_frames` are used again. The `cycles` of the result's settings begin with the last basis.
     """
     pupil = problems[0].model.entrance
     fit: Refinement | None = None
@@ -127,7 +126,7 @@ def fit_in_stages(
 
 
 def _continued(earlier: Refinement | None, fit: Refinement) -> Refinement:
-    """A fit with the time and the history of the one that it continues."""
+    """A fit with the time and the history of the earlier fit that it continues."""
     if earlier is None:
         return fit
     seconds, history = earlier.seconds + fit.seconds, earlier.history + fit.history
@@ -159,11 +158,11 @@ def align_frame(
 ) -> Refinement:
     """Fit place, flux and background of a frame with the wavefront of another fit.
 
-    Lyot stop, blur and internal aberrations are those of the fit. Parameters in
-    `OWN_PARAMETERS` are free, and those of at most `companions` point sources beside the star.
-    Pixels that are bad in all its frames of the same detector pixels are left out. Raises
+    Lyot stop, blur and internal aberrations keep their values in `fit`. Parameters in
+    `OWN_PARAMETERS` are free, and so are at most `companions` point sources beside the star.
+    Pixels that are bad in all frames of `fit` with the same detector pixels are left out. Raises
     `IncompatibleSetupError` for a frame that cannot share a fit with the frames of `fit`, and
-    `ShapeError` for one of another shape.
+    `ShapeError` for a frame of another shape.
     """
     first = fit.frames[0]
     require_agreement([*(frame.observation for frame in fit.frames), observation])
@@ -173,7 +172,7 @@ def align_frame(
             known = other.valid.any(axis=0)
             observation = replace(observation, valid=observation.valid & known)
     if companions:
-        # In frames of a reference star, companions are those of the target, which are not there.
+        # The companions of a fit belong to the target, and are not in frames of a reference star.
         observation = replace(observation, reference=False)
     own = tuple(name for name in settings.free if name in OWN_PARAMETERS)
     alone = replace(
@@ -209,13 +208,13 @@ def join_frames(
     companions: Sequence[Planet] | None = None,
     progress: bool = False,
 ) -> Refinement:
-    """Continue a fit with more frames in its likelihood, such as those of reference stars.
+    """Continue a fit with more frames in its likelihood, such as frames of reference stars.
 
-    `others` are the new frames, aligned with the fit by `align_frame`; `settings` are those of the
-    fit, with a prior on the drift between frames, and `companions` by default its own. Raises
+    `others` are the new frames, aligned with the fit by `align_frame`; `settings` are the fit's
+    with a prior on the drift between frames, and `companions` by default the fit's. Raises
     `IncompatibleSetupError` if the fit was read from a file without its linear model.
     """
-    # The wavefront of the fit is near that of the new frames. A few steps of all unknowns then take
+    # The new frames have nearly the wavefront of the fit. A few steps of all unknowns then take
     # the place of a fit from the map on.
     settings, reached = continue_from(
         replace(fit, settings=settings),
@@ -276,7 +275,7 @@ def refine(
         Default `GaussNewton.nircam()` for frames whose header says NIRCam, else `GaussNewton()`.
     start : dict or sequence of dict, optional
         Starting values by parameter name, for all observations or one by one. "detector_shift"
-        is by default that of the star in the observation.
+        is by default the place of the star in the observation.
     systematics : Systematics, optional
         Known flat-field pattern of other stars, see `learn_systematics`.
     progress : bool
@@ -377,7 +376,7 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
     return list(start)
 
 
-# The flux of the star: from that of a fit to Jansky, and from a catalogue into a fit.
+# The flux of the star: from a fit to Jansky, and from a catalogue into a fit.
 
 _UNTIED = 0.1
 """Relative error of the star's flux in real frames if no catalogue says it. Only diffracted light
@@ -389,22 +388,22 @@ _WITHOUT_MAP = 0.4
 faint in F444W, and 44 % too bright in F356W."""
 
 _HELD = 0.003
-"""Relative deviation of a star's flux from that of a catalogue. The posterior of a fit understates
+"""Relative deviation of a star's flux from the catalogue's. The posterior of a fit understates
 the error of the flux, so that a prior as wide as the catalogue's error would hardly move it."""
 
 _AGREES = 0.005
-"""Relative difference of the star's flux from that of a catalogue that is left: a tenth of the
-error of a good catalogue."""
+"""Largest relative difference between the star's flux and the catalogue's after a fit: a tenth of
+the error of a good catalogue."""
 
 _ROUNDS = 3
-"""Most fits with the flux held, of which each starts from the one before."""
+"""Largest number of fits with the flux held; each starts from the one before."""
 
 _TIGHTER = 100.0
 """Factor by which the next of these fits holds the flux more tightly."""
 
 _DISAGREES = 3.0
-"""Ratio of the star's flux as stated and as fitted, beyond the error of the latter, from which one
-of the two is wrong. Of forty simulated visits the fitted one was at most 1.31 times too bright, and
+"""Ratio of a star's stated and fitted flux, beyond the error of the fit, from which one of the two
+is wrong. The fitted flux was at most 1.31 times too bright in forty simulated visits, and
 from a flat wavefront 1.44 times in real frames. The square is allowed where a fit from a flat
 wavefront did not explain them (3.7 times), and where only the alignment is fitted (6 % with the
 wavefront of a map, 4.2 times with a flat one). Units differ by at least a thousand."""
@@ -438,7 +437,8 @@ def require_calibrated(observation: Observation) -> None:
 def jansky_per_unit(frame: FrameFit) -> float | None:
     """Flux density, Jy, of a star of flux 1 in the unit of a fit; None without calibration.
 
-    Only frames of NIRCam in units of surface brightness, with PIXAR_SR in their header, have one.
+    Only frames of NIRCam in units of surface brightness, with PIXAR_SR in their header, have a
+    calibration.
     """
     area = _pixel_area(frame.observation)
     # The fitted flux is the light that the entrance pupil collects, in the unit of the pixels. What
@@ -498,7 +498,7 @@ def require_agreement_of_flux(fit: Refinement, stated: float) -> None:
         if 1 / limit < jansky / seen < limit:
             meant = (
                 f" {stated:.3g} {unit} would be {jansky:.3g} Jy: state the unit, or convert it. "
-                "That of a spectrum is in the header of its file or the names of its columns."
+                "A spectrum has its unit in the header of its file or the names of its columns."
             )
             break
     raise IncompatibleSetupError(
@@ -516,7 +516,7 @@ def with_star_flux(
     held: float = _HELD,
     progress: bool = False,
 ) -> Refinement:
-    """Continue a fit of one star with its flux held at that of a catalogue, Jy in the filter.
+    """Continue a fit of one star with its flux held at a catalogue's value, Jy in the filter.
 
     `error` is the relative standard deviation of the catalogue's flux, which errors of contrasts
     then include; `held` is the relative deviation from it that the first fit allows. Raises
@@ -554,8 +554,8 @@ def _scale(frame: FrameFit) -> float:
 def star_flux_error(fit: Refinement) -> float:
     """Relative error of the star's flux that is not in the fit's own covariance.
 
-    That of the catalogue, if there is one. Otherwise 10 % for real frames, where only diffracted
-    light tells how bright the star is (40 % without a wavefront map), and 0 for others.
+    The error of the catalogue, if there is one. Otherwise 10 % for real frames, where only
+    diffracted light tells how bright the star is (40 % without a wavefront map), and 0 for others.
     """
     if fit.catalogue_error is not None:
         return fit.catalogue_error

@@ -173,8 +173,8 @@ class Problem:
 def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
     """Refuse frames with another filter, mask, module or pixel scale than the model's.
 
-    Settings that are unknown on either side, such as those of a system that is not an instrument,
-    are not compared. Raises `IncompatibleSetupError`.
+    Settings that are unknown on either side, as for a system that is not an instrument, are not
+    compared. Raises `IncompatibleSetupError`.
     """
     setup, header, name = model.setup, observation.header, observation.name
     setups = (
@@ -243,8 +243,8 @@ class Point:
     opd: Tensor  # (npix, npix), m; complex where the pupil's amplitude is free.
     fields: list[Tensor]  # The star's field at each wavelength, at flux 1.
     image: Tensor  # (ny, nx), the star at flux 1.
-    # (ny, nx), the star in the data's unit, with the known flat-field pattern, also that of the
-    # pedestal, see `Systematics`.
+    # (ny, nx), the star in the data's unit, with the known flat-field pattern in its light and in
+    # the pedestal, see `Systematics`.
     light: Tensor
     star: Tensor  # (ny, nx), the star and the background.
     total: Tensor  # (ny, nx), with the companions.
@@ -274,7 +274,7 @@ class Forward:
             opd = opd + change.to(self.model.device)
         amplitude = vector[unknowns.where("amplitude")]
         # With an OPD o + i b the field is exp(i k o) exp(-k b): a positive imaginary part dims the
-        # pupil. Amplitude coefficients are those of modes of -i nm, and positive ones brighten it.
+        # pupil. Amplitude modes have the unit -i nm, so that positive coefficients brighten it.
         if not len(amplitude):
             return opd
         padded = torch.zeros(len(self.basis), dtype=torch.float64)
@@ -289,7 +289,7 @@ class Forward:
     def at(self, unknowns: FrameUnknowns, vector: Tensor, rendered: Tensor | None = None) -> Point:
         """Render a point, whose `total` has the companions of the mask `rendered` (companions,).
 
-        By default these are those that the frame shows.
+        By default `total` has all companions that the frame shows.
         """
         values, opd = unknowns.values(vector), self.opd(unknowns, vector)
         flux = unknowns.level("flux", vector)
@@ -391,8 +391,8 @@ class Forward:
     def levels(self, point: Point, companions: Tensor) -> Tensor:
         """Derivative of `total` by levels and companions, (unknowns, ny, nx), float32, on the CPU.
 
-        Those by companions are of the coarse copy. That by the flux has the light of `companions`,
-        (k, 3), besides the star's.
+        Derivatives by companions are of the coarse copy. The derivative by the flux has the light
+        of `companions`, (k, 3), besides the star's.
         """
         unknowns, vector = point.unknowns, point.vector
         flux, gain = unknowns.level("flux", vector), self.problem.gain
@@ -417,8 +417,8 @@ class Forward:
             with torch.no_grad():
                 rows.append((flux * self.coarse(opd, **values)).float().cpu())
             moved = self._position_slopes(opd, values)
-            # The place in this frame is R x, so that the derivative by x is R^T times that by the
-            # place.
+            # The place in this frame is R x, so that the derivative by x is R^T times the
+            # derivative by the place.
             turned = torch.tensordot(unknowns.turn.T, moved, dims=1)
             rows += list((flux * source[0] * turned).float())
         return torch.stack(rows) if rows else torch.zeros(0, *point.image.shape)
@@ -426,14 +426,14 @@ class Forward:
     def slopes(self, point: Point, pixels: Tensor, companions: Tensor) -> dict[str, Tensor]:
         """Derivatives of ``(pixels * image).sum()`` through the model itself, by name of unknowns.
 
-        `pixels` is (ny, nx), and `companions` (k, 3) are those that the image shows besides the
-        star. Names are optical parameters, "modes" and, if it is free, "amplitude"; values are
-        float64 on the CPU. `levels` has the derivatives by the other unknowns.
+        `pixels` is (ny, nx), and the image shows `companions` (k, 3) besides the star. Names are
+        optical parameters, "modes" and, if it is free, "amplitude"; values are float64 on the CPU.
+        `levels` has the derivatives by the other unknowns.
         """
         unknowns = point.unknowns
         names = unknowns.optical
-        # They take as long as two or three images, by reverse mode at one wavelength after the
-        # other. `jacobian` has those of a coarse copy at fewer wavelengths, with an error that
+        # The derivatives take as long as two or three images, by reverse mode at one wavelength
+        # after the other. `jacobian` uses a coarse copy at fewer wavelengths, with an error that
         # exceeds a gradient near its zero, and without the light of faint companions.
         lights = self._lights(point, companions)
         totals = [
@@ -488,7 +488,7 @@ class Forward:
         return totals
 
     def _by_modes(self, by_opd: Tensor) -> Tensor:
-        """Derivatives by the modes, from those by the OPD."""
+        """Derivatives by the modes, from derivatives by the OPD."""
         grid = PupilGrid.full(self.model.npix, self.model.diameter)
         modes = torch.zeros(len(self.basis), dtype=torch.float64, requires_grad=True)
         opd = self.basis.opd(modes * NANOMETRE, grid)
@@ -521,13 +521,13 @@ class FrameDerivatives:
     """Derivatives of the pixels of one frame, and where they were computed."""
 
     jacobian: Tensor  # (rows, ny, nx), float32.
-    modes: int  # Number of leading modes that they are by.
+    modes: int  # Number of leading modes with derivatives.
     opd: Tensor  # (npix, npix), m.
-    values: dict[str, Tensor]  # Of the parameters.
-    sources: Tensor  # (companions, 3), those that the frame shows.
-    bright: Tensor  # (k, 3), companions whose light counts in them, see `brightest`.
-    error: float  # Relative error, as that of a `Reading`.
-    allowance: float  # Error that is allowed in this frame, whatever it is in others.
+    values: dict[str, Tensor]  # Values of the parameters.
+    sources: Tensor  # (companions, 3), companions that the frame shows.
+    bright: Tensor  # (k, 3), companions whose light counts in derivatives, see `brightest`.
+    error: float  # Relative error, as in a `Reading`.
+    allowance: float  # Allowed error in this frame, whatever it is in others.
 
     @classmethod
     def at(
@@ -540,7 +540,7 @@ class FrameDerivatives:
     ) -> FrameDerivatives:
         """Derivatives at a point, by its first `modes` modes.
 
-        The model error `outweighing` decides which companions count in them, see `brightest`, and
+        The model error `outweighing` decides which companions count, see `brightest`, and
         `reading` takes the derivatives of the field.
         """
         reading = forward.responses.reading() if reading is None else reading
@@ -557,7 +557,7 @@ class FrameDerivatives:
         )
 
     def is_about(self, point: Point, modes: int, outweighing: float) -> bool:
-        """Whether they are those at a point, see `at`, but for its faint companions."""
+        """Whether these are the derivatives at a point, see `at`, but for its faint companions."""
         unknowns, vector = point.unknowns, point.vector
         return (
             self.modes == modes
@@ -570,7 +570,7 @@ class FrameDerivatives:
         )
 
     def with_companions_of(self, forward: Forward, point: Point) -> FrameDerivatives:
-        """These derivatives, with those by the companions that the frame shows at a point."""
+        """These derivatives, with new ones by the companions that the frame shows at a point."""
         unknowns, vector = point.unknowns, point.vector
         sources = unknowns.visible_sources(vector)
         where = unknowns.where("companions")
@@ -585,7 +585,7 @@ class FrameDerivatives:
 
 
 def allowance(forward: Forward) -> float:
-    """The error of a frame's derivatives that is allowed, whatever it is in others."""
+    """Allowed error of a frame's derivatives, whatever it is in others."""
     # Limits for the target hardly depend on the derivatives of reference stars: with 0.05 they are
     # the same to 4e-4 as with 0.01.
     return ACCURATE if forward.problem.observation.reference else 0.0
@@ -630,7 +630,7 @@ class Objective:
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
         # Which frames show the same pixels of the detector through the same flat field, so that the
-        # error of the systematics is one unknown in all of them. It is noise of every other frame.
+        # error of the systematics is one unknown in all of them. In other frames it is noise.
         self.shares_pattern = _sharing([forward.problem for forward in self.forwards])
         self.robust = robust
 
@@ -673,7 +673,7 @@ class Objective:
             own = torch.hypot(problem.sigma, kappa * point.total) if shares else whole
             weight = torch.where(problem.valid, 1 / own, 0.0)
             if math.isfinite(robust):
-                # Outliers show against all errors, that of the pattern included.
+                # Outliers show against all errors, the pattern's included.
                 residual = self.whitened(k, point, whole)
                 # Cauchy's loss b^2 log(1 + (r/b)^2) has the weight 1 / (1 + (r/b)^2) at residual r.
                 weight = weight * torch.rsqrt(1 + (residual / robust) ** 2)
@@ -733,7 +733,7 @@ class Objective:
 def _sharing(problems: Sequence[Problem]) -> tuple[bool, ...]:
     """Which frames show the same pixels with one flat field, whose pattern is uncertain.
 
-    Of several such sets the largest shares it, or the first one of two equal ones.
+    Of several such sets only the largest shares the pattern, or the first of equal ones.
     """
     places = [
         (seen.first_pixel, seen.shape, flat_field_of(seen.header, seen.name), id(each.systematics))

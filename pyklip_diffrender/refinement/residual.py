@@ -130,7 +130,7 @@ def bright_companions(
     positions = unknowns.sources(state.points[first].vector)[:, 1:] @ unknowns.turn.T
     for known in positions.numpy():
         allowed &= np.hypot(*np.moveaxis(places - known, -1, 0)) > _APART
-    if not allowed.any():  # The frames are smaller than that.
+    if not allowed.any():  # The frames do not reach beyond `inner`.
         return []
     scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
     return [
@@ -195,16 +195,16 @@ _SIGNIFICANT = 6.0
 """Deviation of an outlier in standard deviations, of the prediction from all other pixels."""
 
 _BETTER = 1.3
-"""Smallest ratio of the chi-squared that an outlier explains to that of a point source. For bad
-pixels of NIRCam it was 4 to 30. For the brightest pixel of a planet it is below 0.2 in F444W, and
+"""Smallest ratio of the chi-squared explained by an outlier and by a point source. The ratio was 4
+to 30 for bad pixels of NIRCam. For the brightest pixel of a planet it is below 0.2 in F444W, and
 cannot exceed 1, which it approaches where the image of a point is as sharp as a pixel."""
 
 _DEVIATES = 2.0
-"""Smallest contribution of such a pixel to Sigma^-1 r, which is less than its deviation where the
-fit has taken a part of it."""
+"""Smallest contribution of an outlier to Sigma^-1 r, which is less than the outlier's deviation
+where the fit has taken a part of it."""
 
 _NEAR_COMPANION = 2.0
-"""Pixels between an outlier and a companion that may be nothing else."""
+"""Pixels between an outlier and a companion that may be nothing but the outlier."""
 
 _WRONG = 0.3
 """Smallest deviation of an outlier beside such a companion, relative to the companion's brightest

@@ -50,7 +50,7 @@ User Documentation, "Optics Performance and Stability"), so that the difference 
 grows like a random walk."""
 
 _DRIFTS = (" drift", " dither")
-"""Endings of the names of groups of modes in those of `drift` and `dither_drift`."""
+"""Endings of the names of groups of modes in `drift` and `dither_drift`."""
 
 _DRIFT_RANGE = 4.0
 """Largest factor between the scale of a drift that maximises the evidence and the one stated."""
@@ -61,8 +61,8 @@ _SWITCHES = (
 """Fields of `GaussNewton` that are True or False."""
 
 OWN_PARAMETERS = ("star_offset", "detector_shift", "flux", "background", "pedestal")
-"""Parameters of which every frame has a value of its own when several frames are fitted together;
-the frames share the others."""
+"""Parameters with a value for every frame when several frames are fitted together; the frames
+share the others."""
 
 _RING = (5.0, 16.0)
 _REFERENCE = 1800.0
@@ -72,7 +72,7 @@ G 7-34 in F444W, for which `benchmarks.scene_fidelity` measured what a coarser m
 _VERY_FAINT = 100.0
 
 _COARSE_NPIX = 128
-"""Samples across the pupil for a first look, half of those of `model_for`."""
+"""Samples across the pupil for a first look, half as many as in `model_for`."""
 
 _SHARES = ((100.0, 0.4), (4.0, 0.55), (0.0, 0.77))
 """Share of the spatial frequencies that a first look fits, by how many times the star is fainter
@@ -84,8 +84,8 @@ _QUICK: dict[str, Any] = {
     "tolerance": 0.02,
     "relinearise": 0.3,
 }
-"""Other settings of a first look, whose time and limits `benchmarks.first_look` compares with those
-of full fits. With a tolerance of 1e-3, it takes 1.2 to 1.4 times as long, and median limits change
+"""Other settings of a first look; `benchmarks.first_look` compares its time and limits with full
+fits. With a tolerance of 1e-3, it takes 1.2 to 1.4 times as long, and median limits change
 by up to 4 %; with 0.03, the fit of two rolls of HIP 17695 in F356W ends before it explains the
 frames. Without accurate steps, limits are 1.3 times as large. With three wavelengths in the model,
 the fit does not explain the frames."""
@@ -115,17 +115,17 @@ class GaussNewton:
         its segments.
     deviations : mapping of str to float or Quantity
         Prior standard deviations of free parameters about their starting values, where they
-        differ from those of the parameter table. That of "flux" is relative, and takes a starting
+        differ from the parameter table. The deviation of "flux" is relative, and takes a starting
         value: ``deviations={"flux": 0.05}`` with ``start={"flux": ...}`` ties the contrast scale to
         the star's known brightness, as the light that the pupil collects in the unit of the frames.
     prior : WavefrontPrior
         Prior on the wavefront's change from the starting map.
     adapt_prior : bool
         Where a prior with fixed scales makes the fitted wavefront improbable (status
-        `PRIOR_MISMATCH`), raise its scales, and those of `drift`, towards the highest evidence and
-        continue the fit, up to three times. Where the fitted wavefront is less than 0.8 times as
-        large as its prior says, and a map of the wavefront is known, lower them likewise: with a
-        prior that is too wide, the star's flux comes out too high.
+        `PRIOR_MISMATCH`), raise its scales and the scales of `drift` towards the highest evidence
+        and continue the fit, up to three times. Where the fitted wavefront is less than 0.8 times
+        as large as its prior says, and a map of the wavefront is known, lower the scales likewise:
+        with a prior that is too wide, the star's flux comes out too high.
     marginal_flux : bool
         Fit the flux of the star that is most probable after the wavefront is marginalised, and not
         the most probable pair of both, which is too bright where the data determine many modes.
@@ -157,7 +157,7 @@ class GaussNewton:
     response_npix : int
         Pupil samples of the coarse copy of the model that computes derivatives.
     response_wavelengths : int
-        Largest number of wavelengths at which it does so.
+        Largest number of wavelengths of the coarse copy.
     max_iterations : int
     tolerance : float
         The fit has converged when a step lowers the penalised chi-squared per pixel by less.
@@ -302,7 +302,7 @@ class GaussNewton:
         ----------
         ratios : mapping of str to float
             As ``Refinement.prior_ratios``: by group of modes, followed by " drift" or " dither"
-            for those of `drift` and `dither_drift`, and "amplitude".
+            for groups of `drift` and `dither_drift`, and "amplitude".
         """
         of_drift, of_dither = (_labelled(ratios, label) for label in _DRIFTS)
         return replace(
@@ -318,9 +318,9 @@ class GaussNewton:
         Parameters
         ----------
         size : float
-            By which the scales of all groups are multiplied.
+            Factor by which the scales of all groups are multiplied.
         amplitude : float
-            By which that of the amplitude modes is multiplied, if it is below 1.
+            Factor by which the scale of the amplitude modes is multiplied, if it is below 1.
         """
         prior = self.prior
         scales = {name: size * scale for name, scale in prior.scales.items()}
@@ -333,7 +333,7 @@ class GaussNewton:
         Parameters
         ----------
         ratios : mapping of str to float
-            As for `with_wider_priors`; those of `prior` do not count.
+            As for `with_wider_priors`; ratios of groups of `prior` do not count.
         within : GaussNewton
             Its drifts are the middle of the bounds, a factor of `_DRIFT_RANGE` to either side.
             Dithers may differ by as much as exposures with a slew between them.
@@ -431,8 +431,8 @@ class GaussNewton:
                 amplitude_slope=0.5,
             ),
             adapt_prior=True,
-            # Without it, six planets in pairs of rolls of stpsf came out at 0.96 of their contrast
-            # in the mean, with it at 1.02.
+            # Without a marginal flux, six planets in pairs of rolls of stpsf came out at 0.96 of
+            # their contrast in the mean, with it at 1.02.
             marginal_flux=True,
             # Finer modes cost time and leave chi-squared within 3 %.
             cycles=(_cycles_to_edge(wavelength, reach),),
@@ -475,7 +475,7 @@ def settings_for(observation: Observation) -> GaussNewton:
 
 
 def faintness(observation: Observation) -> float:
-    """By what factor a star is fainter, compared with its noise, than G 7-34 in one roll."""
+    """Factor by which a star is fainter, compared with its noise, than G 7-34 in one roll."""
     frame = observation.combined()
     y, x = np.indices(frame.shape)
     column, row = frame.center[0]
@@ -585,7 +585,7 @@ class ModePriors:
 
     amplitude: Tensor  # (amplitude modes,), standard deviations, nm of an imaginary OPD.
     drift: int  # Number of leading modes of the wavefront that may differ between frames.
-    # For every frame, the blocks of drift that its wavefront has: first that of its exposure
+    # For every frame, the blocks of drift that its wavefront has: first the block of its exposure
     # sequence or, where frames of a sequence share none, its own.
     blocks: tuple[tuple[int, ...], ...]
     # (modes + blocks * drift,), standard deviations relative to the scale of the group.
@@ -652,7 +652,7 @@ class ModePriors:
         return max(of_wavefront, default=0.0) >= _IMPROBABLE
 
     def counted(self, update: EvidenceUpdate) -> ModePriors:
-        """With the number of modes that the data determine."""
+        """These priors, with the number of modes that the data determine."""
         assert update.variance is not None
         deviation = self.deviation
         shares = 1 - update.variance[-len(deviation) :] / deviation**2

@@ -1,8 +1,8 @@
 """Damped Gauss-Newton steps on the unknowns of a fit.
 
 A quick step solves the linearised problem with Gaussian priors. If it does not lower the penalised
-chi-squared, it is repeated with Levenberg-Marquardt damping. Its derivatives are those of a coarse
-copy of the model at an earlier point. Where they are not sufficient, an accurate step follows: by
+chi-squared, it is repeated with Levenberg-Marquardt damping. It uses derivatives of a coarse copy
+of the model at an earlier point. Where these are not sufficient, an accurate step follows: by
 conjugate gradients, with derivatives of the model itself along every direction. The schedule of a
 fit, with a model error that decreases from step to step, is in `annealing`.
 """
@@ -95,7 +95,7 @@ def _frame_unknowns(
     image = forward.at(unknowns, unknowns.initial()).image
     # With photon-noise weights the faint pixels would dominate this first estimate.
     flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
-    # The flux of a catalogue is that of the target.
+    # A catalogue's flux is the target's.
     if problem.observation.reference and "flux" not in problem.start:
         deviations.pop("flux", None)
     is_known = "flux" in deviations
@@ -121,7 +121,7 @@ def _fluxes(state: State) -> list[float]:
 
 
 def _median_flux(problem: Problem, image: Tensor) -> float:
-    """Median of the flux by the pixels where the star is bright.
+    """Median flux of the star from the pixels where it is bright.
 
     Least squares give a negative flux where a companion outshines what the mask leaves of the star.
     """
@@ -150,7 +150,7 @@ class NormalEquations:
 
     @property
     def is_exact(self) -> bool:
-        """Whether the derivatives are those of this state."""
+        """Whether the equations have the derivatives of this state."""
         return all(each.error == 0.0 for each in self.derivatives)
 
     @property
@@ -208,11 +208,11 @@ def linearise(
 ) -> NormalEquations:
     """Linearise all frames about a state, with its first `modes` modes.
 
-    `derive` gives the derivatives of a frame by its index, by default those at the state. A
-    wavefront that drifts between frames needs all modes.
+    `derive` gives the derivatives of a frame by its index, by default at the state. A wavefront
+    that drifts between frames needs all modes.
     """
     size = state.unknowns.with_modes(modes)
-    # S_f distributes the rows of frame f onto the unknowns: that of a leading mode to the shared
+    # S_f distributes the rows of frame f onto the unknowns: the row of a leading mode to the shared
     # mode and to its blocks of drift. With the Jacobians J_f by row and W = diag(w^2),
     #
     #     A = sum_f S_f J_f W_f J_f^T S_f^T - R R^T,    R = sum_f S_f J_f W_f c_f  by pixel,
@@ -266,8 +266,8 @@ def linearise(
 #
 # Normal equations of a coarse copy of the model are wrong where the effects of several unknowns
 # cancel, and steps along such directions are too long. Products of the model's own curvature with a
-# vector take as long as three images. The coarse copy's equations precondition them, and may be
-# those of an earlier step.
+# vector take as long as three images. The coarse copy's equations precondition them, and may come
+# from an earlier step.
 
 _ITERATIONS = 6
 _SUFFICIENT = 0.05
@@ -300,7 +300,7 @@ class ModelDerivatives:
             for forward, point in zip(objective.forwards, state.points, strict=True)
         ]
         self._bright = [point.unknowns.are_bright(point.vector) for point in state.points]
-        # The gradient is that of all light. In the curvature, which determines the path to the
+        # The gradient includes all light. In the curvature, which determines the path to the
         # minimum and not its place, the light of faint companions is linear: it depends on their
         # contrasts and positions and on the star's flux, and not on the wavefront.
         self._without_faint = [
@@ -352,10 +352,10 @@ class ModelDerivatives:
         sources: Sequence[Tensor],
         rough: Mapping[int, LinearFrame],
     ) -> Tensor:
-        """Product of the whitened Jacobian with images of all frames, which it whitens as well.
+        """Product of the whitened Jacobian with images of all frames, which are whitened here.
 
-        The Jacobian by optics and wavefront is that of the star and of `sources`, (k, 3) by frame,
-        or that of a frame in `rough`.
+        The Jacobian by optics and wavefront includes the star and `sources`, (k, 3) by frame;
+        frames in `rough` have their approximate Jacobian.
         """
         objective, unknowns = self._objective, self._state.unknowns
         total = torch.zeros(unknowns.size, dtype=torch.float64)
@@ -395,8 +395,8 @@ def accurate_step(
 
     `curvature` (some, some) is approximate and by the leading unknowns, the only ones that the step
     changes. `offset` (unknowns,) is from the means of the priors, whose standard deviations are
-    `deviation`, and `volume` (some,) is added to the gradient. The flag and the last arguments are
-    those of `conjugate_gradients`.
+    `deviation`, and `volume` (some,) is added to the gradient. See `conjugate_gradients` for the
+    flag and the last arguments.
     """
     count = len(curvature)
     # The step s minimises s (A + p) s - 2 s (g - p x0), with the curvature A and gradient g of the
@@ -475,15 +475,15 @@ _TRIES = 7
 what has a prior hardly moves any more."""
 
 _LEAST = 0.05
-"""Smallest damping, as a multiple of the prior's precision. With less, a step is that without."""
+"""Smallest damping, as a multiple of the prior's precision. Less has no effect on a step."""
 
 _HARDER = 6.0
 """Growth of the damping after an attempt that raised chi-squared: `_TRIES` attempts then span all
 dampings that matter, and each costs one image of every frame."""
 
 _HARD = 2.5
-"""Growth of the damping after a step that gained much less than predicted. It did gain, so that the
-next one needs less than after an attempt that failed."""
+"""Growth of the damping after a step that gained much less than predicted. Since the step did gain,
+the next one needs less damping than after an attempt that failed."""
 
 _EASIER = 0.25
 """Change of the damping after a step that gained what was predicted: a few such steps remove it."""
@@ -500,8 +500,8 @@ _RESPONSES = 4e9
 """Largest number of bytes of stored derivatives."""
 
 _FINAL = 0.01
-"""Error of derivatives above which the linear model of such a fit gets new ones. With 0.05, limits
-were up to 10 % too shallow near the occulter."""
+"""Largest error of the derivatives in the linear model that gives the errors of a fit. With 0.05,
+limits were up to 10 % too shallow near the occulter."""
 
 _FAR = 0.03
 """Model error above which steps fail because they are large. They are damped then."""
@@ -528,16 +528,16 @@ class StepState:
     priors: ModePriors  # With the scales that the step has fitted, unless they are fixed.
     damping: float = 0.0  # Levenberg-Marquardt damping of the next step.
     kappa: float = math.inf  # Model error that the step has assumed.
-    gain: float = 0.0  # Of that step, in chi-squared per pixel, if it was a quick one.
+    gain: float = 0.0  # Gain of that step, in chi-squared per pixel, if it was a quick one.
     # Whether the next step needs derivatives of the model itself, unless kappa grows.
     needs_accurate: bool = False
 
     def without_damping(self) -> StepState:
-        """For a step to which the damping of this one does not apply."""
+        """This state without damping, for a step to which it does not apply."""
         return replace(self, damping=0.0)
 
     def relaxed(self, ratio: float) -> StepState:
-        """With the damping that follows from the ratio of the actual to the predicted gain."""
+        """This state with the damping for a ratio of the actual to the predicted gain."""
         if ratio > _AS_PREDICTED:
             return replace(self, damping=self.damping * _EASIER if self.damping > _NONE else 0.0)
         if ratio < _BELOW_PREDICTED:
@@ -558,9 +558,9 @@ class EquationsCache:
 
     def __init__(self, objective: Objective, responses: ResponseCache) -> None:
         self._objective, self._responses = objective, responses
-        # There is only one set, because the next one is as large: it is freed before others are
-        # computed. Its Jacobians are used again at the same state, and its curvature preconditions
-        # accurate steps from states near it.
+        # There is only one set of equations, because they are large: they are freed before others
+        # are computed. Their Jacobians are used again at the same state, and their curvature
+        # preconditions accurate steps from states near it.
         self.last: NormalEquations | None = None
         self._known: list[FrameDerivatives] = []
         self._preconditions = False
@@ -596,7 +596,7 @@ class EquationsCache:
             forward, point = self._objective.forwards[k], state.points[k]
             enough = max(allowed, allowance(forward))
             if known:
-                # It is freed before the new one, which is as large, is computed.
+                # The old Jacobian is freed before the new one, which is as large, is computed.
                 earlier, known[k] = known[k], None
                 if (
                     earlier is not None
@@ -699,7 +699,7 @@ class Solver:
         may_repeat = self.settings.accurate_steps and modes > 0
         if not (may_repeat and needs_accurate):
             taken, gain, carried = self._quick_step(state, carried, kappa, modes, may_repeat)
-            # That no further step gains anything is for the derivatives of the model to say.
+            # Only derivatives of the model itself can tell that no further step gains anything.
             is_last = may_repeat and gain < self.settings.tolerance and kappa < _FAR
             if taken is not None and not is_last:
                 return Step(taken, gain, carried)
@@ -720,7 +720,7 @@ class Solver:
     #
     # Damping by the prior's precision rather than by the curvature (Marquardt) holds back what the
     # data hardly determine, along which a step is long and the model not linear. Without damping
-    # the step is that of Gauss and Newton. The ratio of the actual decrease of chi-squared to
+    # the step is a Gauss-Newton step. The ratio of the actual decrease of chi-squared to
     # q(x0) - q(x) says how linear the model is over the step, and so how to damp the next one.
 
     def _quick_step(
@@ -741,7 +741,7 @@ class Solver:
         )
         priors = replace(carried.priors, scales=update.scales)
         carried = replace(carried, priors=priors)
-        # Whether no step gains anything is for the derivatives of the model itself to say.
+        # Only derivatives of the model itself can tell that no further step gains anything.
         unmoved = None if may_repeat else state
         expected = self._predicted_gain(unknowns, equations, priors, update.step)
         if expected < self.settings.tolerance * objective.pixels:
@@ -851,7 +851,7 @@ class Solver:
         )
 
     def allowed_error(self, *, final: bool) -> float:
-        """The error of the derivatives that linear models may have, see `linear_model`."""
+        """Largest error of the derivatives in linear models, see `linear_model`."""
         if not self.settings.accurate_steps:
             return self.settings.relinearise
         return _FINAL if final else ACCURATE
@@ -866,7 +866,7 @@ class Solver:
     def companion_snr(self, state: State, priors: ModePriors) -> Tensor:
         """S/N of the companions of a state, (companions,).
 
-        The errors are those of the last linearisation; infinite S/N if it had other companions.
+        Errors come from the last linearisation; the S/N is infinite if it had other companions.
         """
         equations, unknowns = self.equations.last, state.unknowns
         where = unknowns.where("companions")

@@ -3,8 +3,8 @@
 The vector of a frame has its optical parameters, levels, companions, amplitude and wavefront. The
 vector of all frames begins with the unknowns that differ between frames, frame by frame. Then come
 the shared ones in the order of a frame's vector, with the wavefront modes last. At its end are
-the blocks of drift, by which the leading modes of a frame differ from the shared modes: those of
-its exposure sequence, and its own.
+the blocks of drift, by which the leading modes of a frame differ from the shared modes: a block of
+its exposure sequence, and one of its own.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ _LINEAR = tuple(p.name for p in LEVELS)
 
 _BRIGHT = 1e-4
 """Contrast of a companion whose light counts in the Jacobian by optics, flux and wavefront. A
-change of the wavefront by 10 nm moves 1 % of it. Without these derivatives, companions of 1e-3 have
-false candidates beside them, and errors of a S/N above 30 are too small. They take as long as
-those of the star."""
+change of the wavefront by 10 nm moves 1 % of this light. Without its derivatives, companions of
+1e-3 have false candidates beside them, and errors of a S/N above 30 are too small. The derivatives
+take as long as the star's."""
 
 _OUTWEIGHED = 0.3
-"""Contrast over the error of the star's model below which these derivatives do not matter yet. Two
-rolls of G 7-34 need a fifth less memory without them. The last linear model has all of them."""
+"""Contrast over the error of the star's model below which the derivatives of a companion's light do
+not matter yet. Two rolls of G 7-34 need a fifth less memory without them. The last linear model has
+all of them."""
 
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
@@ -43,7 +44,7 @@ def brightest(sources: Tensor, kappa: float = 0.0) -> Tensor:
 
     The result is (1, 3), or (0, 3) if none does or a model error `kappa` outweighs it.
     """
-    # One, because its derivatives take as long as those of the star.
+    # One companion, because its derivatives take as long as the star's.
     first = sources[sources[:, 0].argsort(descending=True)[:1]]
     return first[first[:, 0] > max(_BRIGHT, _OUTWEIGHED * kappa)]
 
@@ -65,7 +66,7 @@ class FrameUnknowns:
     # Degrees by which the sky is turned, counter-clockwise, relative to the first frame.
     roll: float = 0.0
     shows_companions: bool = True  # False for a reference star.
-    # Prior standard deviations that replace those of the parameter table.
+    # Prior standard deviations that replace the defaults in the parameter table.
     deviations: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -158,7 +159,7 @@ class FrameUnknowns:
 class Unknowns:
     """The unknowns of all frames."""
 
-    # They differ in their starting values, roll and companions' visibility only.
+    # Frames differ in their starting values, roll and companions' visibility only.
     frames: tuple[FrameUnknowns, ...]
     own: tuple[str, ...] = ()  # Names of the parameters that differ between frames.
     drift: int = 0  # Number of leading modes that may differ between frames.
@@ -226,7 +227,7 @@ class Unknowns:
         return tuple(labels)
 
     def _joined(self, vectors: Iterable[Tensor]) -> Tensor:
-        """The vector of all frames from theirs; shared unknowns are those of the first frame."""
+        """Join the vectors of all frames; shared unknowns are taken from the first."""
         joined = torch.zeros(self.size, dtype=torch.float64)
         for part, vector in reversed(list(zip(self.rows, vectors, strict=True))):
             joined[part.rows[: len(vector)]] = vector
@@ -257,7 +258,7 @@ class Unknowns:
         """The vector after a step of the leading unknowns, within the bounds of all parameters."""
         moved = vector.clone()
         # The image is linear in the light of companions, the product of flux and contrast, and not
-        # in both factors. The step is therefore that of the light, F' c' = F c + c (F' - F) + F dc,
+        # in both factors. The step is taken in the light: F' c' = F c + c (F' - F) + F dc,
         # and the contrast after it is c' = c + dc F / F'.
         moved[: len(step)] += step
         before, after = self._flux_with_companions(vector), self._flux_with_companions(moved)

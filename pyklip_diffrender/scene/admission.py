@@ -27,10 +27,10 @@ EPOCH = 5.0
 """Days between frames that may share a wavefront map."""
 
 _TWO_STARS = 1.0
-"""arcsec between stars with other names on one date that are not one star."""
+"""arcsec between two stars of different names on one date, beyond which they are not one star."""
 
 _USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
-"""Levels of frames that are still those of the detector, the best first."""
+"""Levels of frames with the detector's own pixels, the best first."""
 
 _NOT_USABLE = {
     "i2d": "a resampled image (i2d), whose pixels are not the detector's",
@@ -58,17 +58,17 @@ class Admission:
         self.reasons: Reasons = {each: each.fault for each in self.files if each.fault}
 
     def copy(self) -> Admission:
-        """The same files, of which others can be left out."""
+        """A copy from which other files can be left out."""
         copied = Admission(self.files)
         copied.reasons |= self.reasons
         return copied
 
     def left(self, files: Iterable[FrameFile] | None = None) -> list[FrameFile]:
-        """The files that are not left out, of some, or of all by default."""
+        """Files that are not left out, among `files` or by default all."""
         return [e for e in (self.files if files is None else files) if e not in self.reasons]
 
     def apply(self, rule: Callable[..., Reasons], *groups: Iterable[FrameFile]) -> None:
-        """Leave files out by a rule, which gets what is left of each group, by default all."""
+        """Leave files out by a rule, which gets the files left in each group, by default all."""
         self.reasons |= rule(*map(self.left, groups or (self.files,)))
 
     def require_some(self) -> None:
@@ -109,7 +109,7 @@ def exposures_in(
 ) -> list[FrameFile]:
     """Find the files that are meant, and read their headers; raises as `listed_files`.
 
-    Files that are all marked as those of reference stars are of the target if there are
+    If all files are marked as frames of reference stars, they are of the target if there are
     `references`. With a `filter`, the frames of its calints files are read at once, so that none of
     these is opened twice; files of other levels may be copies, which are not read.
     """
@@ -152,7 +152,7 @@ def _without_star(files: Iterable[FrameFile]) -> Reasons:
 
 
 def with_odd_pixels(files: Iterable[FrameFile]) -> Reasons:
-    """Files that cannot be frames of a star behind a mask, by their pixels, which this reads."""
+    """Read the pixels, and find files that cannot be frames of a star behind a mask."""
     return _with_reasons((each, each.fault_of_pixels) for each in files)
 
 
@@ -191,9 +191,9 @@ def _why_unusable(exposure: Exposure) -> str:
 
 
 def _moment(file: FrameFile) -> tuple[object, ...] | None:
-    """Identity, roll and time, which the files of one exposure share; None if they are not known.
+    """Identity, roll and time, which files of one exposure share; None if they are not known.
 
-    Copies whose headers were given another roll or date are no files of one exposure.
+    Copies whose headers were given another roll or date count as other exposures.
     """
     exposure = file.exposure
     if exposure.identity is None:
@@ -207,7 +207,7 @@ def _moment(file: FrameFile) -> tuple[object, ...] | None:
 
 
 def _same_files(files: Iterable[FrameFile]) -> Reasons:
-    """Files that are there twice, also packed and unpacked."""
+    """Files given twice, also packed and unpacked."""
     reasons: Reasons = {}
     for group in _groups(files, lambda each: unpacked_name(str(each.path.resolve()))):
         best, *others = sorted(group, key=lambda each: _rank(each.exposure))
@@ -216,7 +216,7 @@ def _same_files(files: Iterable[FrameFile]) -> Reasons:
 
 
 def _same_exposures(files: Iterable[FrameFile]) -> Reasons:
-    """Files of one exposure, but for the best whose pixels can be used."""
+    """Files of one exposure, except the best file whose pixels can be used."""
     reasons: Reasons = {}
     for group in _groups(files, _moment):
         ranked = sorted(group, key=lambda each: _rank(each.exposure))
@@ -251,10 +251,10 @@ def _rank(exposure: Exposure) -> int:
 
 
 def choose_filter(admission: Admission, filter: str | None) -> str:
-    """Leave out frames of other filters; returns the one that is left.
+    """Leave out frames of other filters; returns the filter that is left.
 
-    IncompatibleSetupError if none was chosen and there are several, or none of the chosen one;
-    NoValidPixelsError if no file states its filter.
+    IncompatibleSetupError if no filter was chosen and the files have several, or if no file has the
+    chosen filter; NoValidPixelsError if no file states its filter.
     """
     admission.apply(_without_filter)
     admission.require_some()
@@ -358,8 +358,8 @@ def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
 
     Frames of reference stars that are not known are stars of their own.
     """
-    # A frame may be alike to several groups: by its name to one, by its coordinates to another.
-    # They then become one.
+    # A frame may belong to several groups: by its name to one, by its coordinates to another.
+    # These groups are then joined.
     groups: list[list[FrameFile]] = []
     for each in files:
         alike = [
@@ -386,9 +386,9 @@ def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
 
 
 def _are_two_stars(one: Exposure, other: Exposure) -> bool:
-    """Whether two exposures of one epoch show stars with other names, more than an arcsec apart.
+    """Whether two exposures of one epoch show stars of other names, more than an arcsec apart.
 
-    The stars of a binary are; coordinates of one star may differ by more between epochs.
+    This tells the stars of a binary; between epochs, coordinates of one star may differ by more.
     """
     apart = one.star.separation(other.star)
     if apart is None or apart <= _TWO_STARS or not (one.star.names and other.star.names):
@@ -440,9 +440,9 @@ def of_other_setups(science: Sequence[FrameFile], references: Sequence[FrameFile
 
 
 def unoriented(science: Sequence[FrameFile]) -> Reasons:
-    """Frames of the target whose roll or date is not known, where there are several.
+    """Frames of the target whose roll or date is not known, where there are several frames.
 
-    IncompatibleSetupError if it is known of none of them.
+    IncompatibleSetupError if no frame has the roll or the date.
     """
     facts: tuple[tuple[str, Callable[[Exposure], object]], ...] = (
         ("orientation on the sky (ROLL_REF with V3I_YANG)", lambda each: each.position_angle),
@@ -468,9 +468,9 @@ def unoriented(science: Sequence[FrameFile]) -> Reasons:
 
 
 def copied(files: Sequence[FrameFile]) -> Reasons:
-    """Frames whose pixels are those of another file, whatever the headers say."""
+    """Frames with the pixels of another file, whatever the headers say."""
     return {
-        files[k]: f"its pixels are those of {files[j].name}: a copy of the exposure"
+        files[k]: f"it has the pixels of {files[j].name}: a copy of the exposure"
         for k, j in copies(_frames(files)).items()
     }
 
@@ -481,7 +481,7 @@ def turned(files: Sequence[FrameFile]) -> Reasons:
 
 
 def of_other_brightness(files: Sequence[FrameFile]) -> Reasons:
-    """Frames of one star that is much brighter or fainter in them than in the others."""
+    """Frames in which a star is much brighter or fainter than in its other frames."""
     return _contradicting(files, why_other_brightness(_frames(files)))
 
 
@@ -495,13 +495,13 @@ def _contradicting(files: Sequence[FrameFile], odd: Mapping[int, str]) -> Reason
         names = ", ".join(each.name for each in files)
         raise IncompatibleSetupError(
             f"{names} contradict each other: for {files[min(odd)].name}, {odd[min(odd)]}. Leave "
-            "out those that are wrong, or correct them"
+            "out the wrong files, or correct them"
         )
     return {files[k]: reason for k, reason in odd.items()}
 
 
 def _frames(files: Sequence[FrameFile]) -> list[Observation]:
-    """Frames of files that were judged, all of which have some."""
+    """Frames of files that were judged, each of which has frames."""
     return [each.observation for each in files if each.observation is not None]
 
 

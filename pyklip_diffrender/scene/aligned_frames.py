@@ -1,4 +1,4 @@
-"""Undo the shifts of aligned frames, so that their pixels are those of the detector.
+"""Undo the shifts of aligned frames, so that they have the pixels of the detector.
 
 A flat-field error belongs to a pixel of the detector. spaceKLIP's alignment moves frames by
 fractions of a pixel, by a Fourier shift, after which a pixel of the array is a mixture of pixels of
@@ -45,36 +45,36 @@ _REACH = 4
 """Pixels about a gap from which it is filled."""
 
 _RESOLUTION = 1.1
-"""Standard deviation of the Gaussian autocorrelation of images in filled gaps, pixels: that of a
+"""Standard deviation of the Gaussian autocorrelation of images in filled gaps, pixels, as for a
 point source at 4 microns."""
 
 _NUGGET = 1e-3
 """Noise of the pixels relative to the image's variance, which keeps the equations regular."""
 
 _BESIDE = 2.3
-"""Pixels from a gap within which others are predicted, to see how good that is."""
+"""Pixels from a gap within which known pixels are predicted, to see how good predictions are."""
 
 _DOUBT = 0.25
-"""Variance that what was filled in may add, relative to that of the pixel."""
+"""Largest variance that filled pixels may add, relative to the variance of the pixel."""
 
 _PART = 0.1
 """Squared weight of a gap above which a pixel is masked, however well it was filled."""
 
 _MISPLACED = 0.3
-"""Pixels of a star from its stated position beyond which that may be wrong by a pixel: the star is
-measured to a tenth of a pixel, and is within 0.2 pixel of the mask."""
+"""Pixels between a star and its stated position beyond which the position may be wrong by a pixel:
+the star is measured to a tenth of a pixel, and is within 0.2 pixel of the mask."""
 
 _CROPPED = 32
 """Whole pixels beyond which frames were cropped, and not only aligned."""
 
 SAME_PLACE_PIXELS = 0.02
-"""Pixels within which two records are of one place: they agree to 0.001 in real files."""
+"""Pixels within which two records state one place: the records agree to 0.001 in real files."""
 
 
 def recorded_shifts(
     hdus: fits.HDUList, center: NDArray[np.float64], shape: tuple[int, ...], name: str
 ) -> NDArray[np.float64] | None:
-    """By how much spaceKLIP has shifted the frames of a file, (frames, 2), x, y in pixels, or None.
+    """Shifts of the frames of a file by spaceKLIP, (frames, 2), x, y in pixels, or None.
 
     `center` is x, y of the star in the first frame, 0-indexed, `shape` frames, rows and columns.
     ShapeError or NonFiniteError if there are not two finite numbers for every frame.
@@ -102,10 +102,10 @@ def recorded_shifts(
 
 
 def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
-    """Where the mask's centre is imaged on the whole detector, x, y in pixels from 0, (2,).
+    """Place of the mask's centre on the whole detector, x, y in pixels from 0, (2,).
 
-    By DETECTOR, FILTER, and the mask in CORONMSK, APERNAME or SUBARRAY. None if the header does not
-    say, or where it was not measured, as in module B.
+    The place follows from DETECTOR, FILTER, and the mask in CORONMSK, APERNAME or SUBARRAY. None if
+    the header does not say, or if the place was not measured, as in module B.
     """
     detector, mask = detector_of(header, name), image_mask(header, name)
     if detector is None or mask is None or module_of(header, name) == "B":
@@ -123,10 +123,10 @@ def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
 def net_shifts(
     shifts: NDArray[np.float64], star: NDArray[np.float64], mask: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """How far the light of every frame is from the detector's pixels that it fell on, (frames, 2).
+    """Distance of every frame's light from the detector's pixels that it fell on, (frames, 2).
 
-    `shifts` and `star`, the star in the array, are (frames, 2), `mask` is that on the detector,
-    (2,), all x, y in pixels. Without a mask, whole pixels are left out.
+    `shifts` and `star`, the place of the star in the array, are (frames, 2), `mask` is the place of
+    the mask on the detector, (2,), all x, y in pixels. Without a mask, whole pixels are left out.
     """
     # A file records by how much its frames were shifted, but not by how many whole pixels they were
     # cut or padded afterwards, all alike. These follow from the star, which was within half a pixel
@@ -152,7 +152,7 @@ def first_pixel(
     column, row = (int(each or 0) - 1 for each in start)
     mask = mask_place(header, name)
     if header_text(header, "SUBARRAY", name) is None:
-        mask = None  # Of a subarray that is not named, the beginning may be anywhere.
+        mask = None  # A subarray that is not named may begin anywhere.
     away = 0.0 if mask is None else float(np.abs(np.add(star, (column, row)) - mask).max())
     if away > _NEAR or not on_detector((column, row), shape):
         _log.warning(
@@ -188,7 +188,7 @@ def undo_shifts(
     pairs = [filled(frame, gap) for frame, gap in zip(data, missing, strict=True)]
     moved = shift_frames(np.stack([frame for frame, _ in pairs]), shifts)
     leaked = _spread(np.stack([each for _, each in pairs]) ** 2, shifts)
-    del pairs  # They are as large as the frames.
+    del pairs  # The pairs are as large as the frames.
     gaps = _spread((missing | unknown).astype(float), shifts)
     variance = shift_variances(error, ~unknown, shifts)
     valid = (leaked < _DOUBT * variance) & (gaps < _PART)
@@ -292,8 +292,8 @@ def shift_frames(frames: NDArray[np.float64], shifts: NDArray[np.float64]) -> ND
 def _records_agree(arguments: dict[str, Any], left: NDArray[np.float64]) -> bool:
     """Whether shifts and the star's positions in the array and behind the mask are of one place.
 
-    Frames are cropped by whole pixels; what is left of the star's position, (frames, 2), less that
-    of the mask and the shift, is otherwise the star's position behind the mask.
+    `left`, (frames, 2), is the star's position less the mask's and the shift. Frames are cropped by
+    whole pixels; up to these, it is the star's position behind the mask.
     """
     if arguments.get("star_offset") is None:
         return False
@@ -310,7 +310,7 @@ def on_detector_pixels(
 ) -> dict[str, Any]:
     """Undo the shifts by which frames were aligned, up to whole pixels: the changed arguments.
 
-    `arguments` are those of `read_calints`; their arrays are overwritten. `center`, x, y of the
+    `arguments` come from `read_calints`; their arrays are overwritten. `center`, x, y of the
     star from 0, and `shifts`, x, y in pixels, are (frames, 2). With `is_measured` the star's
     position is compared with its light, unless the file's own records agree with each other.
     """
@@ -349,7 +349,7 @@ def on_detector_pixels(
     sure = mask is not None and on_detector((column, row), data.shape[1:])
     agree = mask is not None and _records_agree(arguments, center - mask - shifts)
     if sure and is_measured and not agree:
-        # The whole pixels of the place are those of the star's stated position.
+        # The place has its whole pixels from the star's stated position.
         frame = data[0].astype(float), error[0].astype(float), usable[0]
         scale = float(np.mean(arguments["pixelscale"]))
         away = measured_offset(*frame, (center + pixels - net)[0], scale)

@@ -21,7 +21,7 @@ from pyklip_diffrender.io.files import fits_files, read_text
 _log = logging.getLogger(__name__)
 
 Role = Literal["science", "psf"]
-"""What an association says of a member: of the target, or of a reference star."""
+"""Role of a member of an association: the target, or a reference star."""
 
 _SUFFIX = ".json"
 """Suffix of association files, in any case."""
@@ -37,9 +37,9 @@ class ListedFile:
 
 
 def matches(path: Path) -> list[Path]:
-    """The path itself, or where nothing has that name, the files that it is a pattern of, sorted.
+    """The path itself or, where nothing has that name, the files that match it, sorted.
 
-    Patterns are those of `glob`: frames/*_calints.fits, or frames/** for all folders inside.
+    Patterns are as in `glob`: frames/*_calints.fits, or frames/** for all folders inside.
     """
     if path.exists() or not glob.has_magic(str(path)):
         return [path]
@@ -97,7 +97,7 @@ def _agreed(roles: set[Role | None]) -> Role | None:
 
 
 def _members(path: Path) -> list[ListedFile]:
-    """The members of an association file, those of other types than science and psf last."""
+    """The members of an association file, last the ones of other types than science and psf."""
     members = _read(path)
     if isinstance(members, str):
         return [ListedFile(path, reason=members)]

@@ -1,6 +1,6 @@
 """The exposure of a file and the star that it shows, as header and file name describe them.
 
-No card has a default here: a value that is not stated is None, and whoever needs it has to say so.
+No card has a default here: a value that is not stated is None.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ _LEVELS = (
     "calints", "crfints", "cal", "crf", "rateints", "rate", "uncal", "ramp", "jump", "dark",
     "trapsfilled", "i2d", "s2d", "psfsub", "psfalign", "psfstack", "x1d", "segm", "cat",
 )  # fmt: skip
-"""Products of the pipeline: those that can be used come first, the best of them in front."""
+"""Products of the pipeline, the usable ones first, and of these the best first."""
 
 _STEPS = {"S_KLIP": "psfsub", "S_PSFALI": "psfalign", "S_PSFSTK": "psfstack", "S_RESAMP": "i2d"}
-"""Steps of the pipeline after which frames are no longer those of a detector."""
+"""Steps of the pipeline after which frames no longer have a detector's own pixels."""
 
 _NAME = re.compile(
     r"jw(\d{5})(\d{3})(\d{3})_(\d{2})(\d)(\w{2})_(\d{5})(?:-seg(\d{3}))?_([a-z0-9]+)", re.IGNORECASE
@@ -62,7 +62,7 @@ def level_of(header: fits.Header, name: str, dimensions: int) -> str | None:
     texts = (Path(name).name, header_text(header, "FILENAME", name) or "")
     named = [match[1].lower() for match in map(_LEVEL.search, texts) if match]
     known = [each for each in named if each in _LEVELS]
-    # If the names disagree, the frames are what they are least useful as.
+    # If the names disagree, the least useful product is assumed.
     stated = max(known, key=_LEVELS.index, default=None)
     unit = (header_text(header, "BUNIT", name) or "").upper().replace(" ", "")
     if unit in ("DN/S", "ADU/S", "COUNT/S") and stated in (None, "calints", "cal"):
@@ -135,7 +135,7 @@ _SAME_MOTION = 0.01
 agree to a few milliarcseconds, and a background source is measured to about ten."""
 
 _OLDEST = 2000.0
-"""Julian year of the oldest coordinates that proposals have: those of the equinox J2000."""
+"""Julian year of the oldest coordinates in proposals: coordinates of the equinox J2000."""
 
 
 @dataclass(frozen=True)
@@ -155,14 +155,14 @@ class CatalogueStar:
         return bool(self.names or self.coordinates)
 
     def is_called(self, name: str) -> bool:
-        """Whether one of the names is this one, in any spelling."""
+        """Whether the star has this name, in any spelling."""
         return any(same_name(name, each) for each in self.names)
 
     def separation(self, other: CatalogueStar) -> float | None:
         """Arcsec between the coordinates of two headers at one epoch; None if one has none.
 
         TARG_RA and TARG_DEC are of the catalogue's epoch in some headers and of the exposure in
-        others, and no card says which: the separation is the least of those that are possible.
+        others, and no card says which: the separation is the least of the possible ones.
         """
         if self.coordinates is None or other.coordinates is None:
             return None
@@ -172,7 +172,7 @@ class CatalogueStar:
         return float(np.rad2deg(apart.min()) * 3600)
 
     def _places(self, year: float, motion: tuple[float, float] | None) -> NDArray[np.float64]:
-        """RA and Dec in radians in a year, (2, epochs); `motion` is used where there is no own."""
+        """RA and Dec in radians in a year, (2, epochs); `motion` is used if the star has none."""
         east, north = self.motion or motion or (0.0, 0.0)
         rate = np.deg2rad(np.hypot(east, north) / 3600)
         years = year - np.array(self.epochs or (_OLDEST, year))
@@ -237,7 +237,7 @@ def _motion(header: fits.Header, name: str) -> tuple[float, float] | None:
 def proper_motion(header: fits.Header, name: str) -> tuple[float, float] | None:
     """Proper motion of the star, arcsec per year (MU_RA, which includes cos Dec, and MU_DEC).
 
-    None if the header does not state it, as an empty proposal does not with two zeros;
+    None if the header does not state it, or states two zeros, as for an empty proposal;
     CorruptFileError if no star moves as fast.
     """
     motion = _motion(header, name)
@@ -253,8 +253,8 @@ def proper_motion(header: fits.Header, name: str) -> tuple[float, float] | None:
 def common_motion(headers: Iterable[tuple[fits.Header, str]]) -> tuple[float, float] | None:
     """Proper motion of a star, arcsec per year, from several headers with the names of their files.
 
-    It is the mean of what the headers state; None if none of them does. IncompatibleSetupError if
-    two of them disagree.
+    The motion is the mean of what the headers state; None if no header states it.
+    IncompatibleSetupError if two headers disagree.
     """
     known = [
         (name, motion)
@@ -284,7 +284,7 @@ _MODULE = re.compile(r"(?:NRC|MASK|SUB\d+)?([AB])(?=\d|[LS]WB|LONG|$)")
 """NIRCam's module in a detector (NRCALONG), MODULE (A), CORONMSK or SUBARRAY."""
 
 _SAME_ANGLE = 0.1
-"""Degrees by which the sum of two angles may differ from what a card says it is."""
+"""Degrees by which the sum of two angles may differ from the sum in a card."""
 
 _LONGEST = 2.0
 """Days from the beginning of an exposure to its middle, or to the midnight before."""
@@ -318,9 +318,9 @@ class Exposure:
 
     @classmethod
     def of(cls, header: fits.Header, name: str, shape: tuple[int, ...] = ()) -> Exposure:
-        """Read the facts from the merged headers; `shape` is that of the science data.
+        """Read the facts from the merged headers and the `shape` of the science data.
 
-        CorruptFileError if a card holds something else than it should, or two contradict each
+        CorruptFileError if a card holds something else than it should, or two cards contradict each
         other.
         """
 
@@ -373,7 +373,7 @@ def image_mask(header: fits.Header, name: str) -> str | None:
         if match is not None:
             stated[key] = f"MASK{match[1]}"
         elif key == "CORONMSK" and text:
-            # Of other instruments, or none.
+            # Masks of other instruments, or none.
             stated[key] = text
     return _agreed(stated, header, "masks", name)
 
@@ -469,7 +469,7 @@ def beginning(header: fits.Header, name: str) -> Time | None:
 def middle(header: fits.Header, name: str) -> Time | None:
     """Middle of an exposure, UTC (EXPMID); None if the header does not say.
 
-    CorruptFileError if it is more than two days from the beginning.
+    CorruptFileError if the middle is more than two days from the beginning.
     """
     day = header_number(header, "EXPMID", name)
     if not day:

@@ -36,7 +36,7 @@ class FrameFile:
 
     path: Path
     exposure: Exposure
-    fault: str = ""  # why it has no frames by what its headers say, or empty
+    fault: str = ""  # why the headers say that the file has no frames, or empty
     for_reference: bool = False  # asked for as a reference star's, whatever its header says
     is_product: bool = False  # made from frames, and has none
     place: tuple[float, float] | None = None  # x, y of the star, from 0, if not the header's
@@ -77,7 +77,7 @@ class FrameFile:
         return self.path.name
 
     def marked(self, *, reference: bool) -> FrameFile:
-        """The file as one of a reference star, or of the target, whatever its header says."""
+        """The file marked as a reference star's or the target's, whatever its header says."""
         return replace(self, exposure=replace(self.exposure, reference=reference))
 
     @cached_property
@@ -95,18 +95,18 @@ class FrameFile:
             why_few_pixels(frames)
             or why_odd_noise(frames.noise_ratios)
             or why_odd_unit(frames)
-            # Where the user has stated the star's position, it is not judged whether it is there.
+            # Where the user has stated the star's position, the position is not judged.
             or ("" if self.place is not None else why_no_star(frames))
         )
 
     @property
     def observation(self) -> Observation | None:
-        """The mean of the integrations of each pointing that are used; None if there is none."""
+        """Mean of the used integrations of each pointing; None if no integration is used."""
         return self._judged[0]
 
     @property
     def fault_of_pixels(self) -> str:
-        """Why the pixels cannot be those of a star behind the mask; empty if they can."""
+        """Why the pixels cannot show a star behind the mask; empty if they can."""
         return self._judged[1]
 
 

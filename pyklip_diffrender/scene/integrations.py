@@ -48,7 +48,7 @@ def checked_frames(
 ) -> dict[str, Any]:
     """Return the attributes of an `Observation`, checked, in its units, and copied.
 
-    The arguments are those of `Observation.from_arrays`, which says what is raised.
+    For the arguments and the exceptions see `Observation.from_arrays`.
     """
     name = details.get("name", "observation")
     unit = _unit(unit, name)
@@ -85,7 +85,7 @@ def mask_unusable(frames: Mapping[str, Any], valid: NDArray[np.bool_] | None = N
     """Set data to 0, errors to 1 and valid to False where pixels cannot be used, in place.
 
     The arrays of `frames`, and `valid`, which says what else is not to be used, are
-    (frames, ny, nx). Frame by frame, which takes no memory.
+    (frames, ny, nx). They are changed frame by frame, which takes no memory.
     """
     for k, (data, error, good) in enumerate(
         zip(frames["data"], frames["error"], frames["valid"], strict=True)
@@ -174,10 +174,10 @@ Stack = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _AT_ONCE = 2**18
-"""Pixels of which the median is taken at once, which bounds the memory that it takes."""
+"""Largest number of pixels in one call of the median, which bounds its memory."""
 
 _FEW = 3
-"""Integrations below which none is an exception among the others."""
+"""Number of integrations below which none can be told from the others."""
 
 _BRIGHT = 10.0
 """S/N of the pixels that show how bright the star is."""
@@ -201,7 +201,7 @@ _NEAR = 3.0
 """arcsec from the star within which the masked pixels of an integration are counted."""
 
 _MOST = 0.25
-"""Share of these above which an integration is left out."""
+"""Share of masked pixels above which an integration is left out."""
 
 
 _SAME_PLACE = 0.3
@@ -262,9 +262,8 @@ def judge_integrations(
     """Compare integrations of one pointing, (frames, ny, nx), with their median.
 
     Pixels that deviate are masked in `valid`, in place. `center` is x, y of the star, (frames, 2),
-    in pixels, `pixelscale` x, y in arcsec per pixel, `names` are those of the integrations in
-    remarks, such as "integration 3 of 8", and `group` has the indices of the pointing's
-    integrations.
+    in pixels, `pixelscale` x, y in arcsec per pixel, `names` call the integrations in remarks, such
+    as "integration 3 of 8", and `group` has the indices of the pointing's integrations.
     """
     group = np.arange(len(data)) if group is None else group
     kept = np.ones(len(data), dtype=bool)
@@ -361,7 +360,7 @@ def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
 
 
 def _brightness(frame: Stack, median: Stack, sigma: Stack, usable: Mask) -> float:
-    """Brightness of the star over that in the median; 1 if the star is not seen."""
+    """Ratio of the star's brightness in a frame and in the median; 1 if the star is not seen."""
     # sum of (frame - a median)^2 is minimal at a = sum of frame median / sum of median^2.
     bright = usable & (median > _BRIGHT * sigma)
     norm = float((median[bright] ** 2).sum())
@@ -419,21 +418,21 @@ _log = logging.getLogger(__name__)
 Image = NDArray[np.float64]
 
 _FAR = 6.0
-"""arcsec from the star beyond which its light adds no noise. Closer than that a bright star's light
-still shows in differences of neighbouring pixels."""
+"""arcsec from the star beyond which its light adds no noise. Closer in, a bright star's light still
+shows in differences of neighbouring pixels."""
 
 _ENOUGH = 2000
 """Number of far pixels below which the errors are left as they are."""
 
 _PLAUSIBLE = (0.1, 5.0)
-"""Ratio of scatter and errors beyond which the errors are not those of these pixels. It was 0.4 to
+"""Ratios of scatter and errors beyond which the errors belong to other pixels. The ratio was 0.4 to
 1.2 in the real frames at hand."""
 
 _SMOOTHED = 15
 """Side of the squares, pixels, whose mean light tells which parts of a frame are dark."""
 
 _STARLIT = 4.0
-"""Standard deviations of these means above their median from which a part is not dark."""
+"""Standard deviations from the median of the mean lights above which a part is not dark."""
 
 _DARKEST = 0.25
 """Least share of the far pixels that is taken as dark, in a field that is full of sources."""

@@ -1,6 +1,6 @@
 """A star, its planets, and the photons that arrive from them.
 
-The calibration is that of appendix A of B. Y. Feng et al., "Exoplanet Imaging via Differentiable
+The calibration follows appendix A of B. Y. Feng et al., "Exoplanet Imaging via Differentiable
 Rendering" (2025): beta Pictoris, two hours, NIRCam F444W.
 """
 
@@ -116,7 +116,7 @@ class Planet:
     Attributes
     ----------
     contrast : float
-        Flux of the planet over that of the star, before the coronagraph.
+        Ratio of the planet's flux to the star's, before the coronagraph.
     separation : float
         arcsec.
     position_angle : float

@@ -194,8 +194,8 @@ def _judged(
 ) -> tuple[dict[str, Any], NDArray[np.bool_], NDArray[np.bool_]]:
     """Read and judge an open file, in place, so that its integrations are in memory once.
 
-    The attributes of the observation; which of its integrations are kept, (frames,), and which of
-    the file's are not empty, (integrations,).
+    Returns the attributes of the observation, which of its integrations are kept, (frames,), and
+    which integrations of the file are not empty, (integrations,).
     """
     arguments, shifts = read_calints(hdus, path, compact=compact, star=star)
     arguments, shifts, empty = without_empty(arguments, shifts)
@@ -271,8 +271,8 @@ class Observation:
         Scatter of the file's pixels far from the star over their stated errors, for every frame,
         before the errors were corrected; NaN where it could not be measured.
     integrations : tuple of int
-        Number of integrations of the detector that each frame is the mean of; empty where each
-        frame is one.
+        Number of integrations of the detector that each frame averages; empty where each frame is
+        one integration.
 
     Examples
     --------
@@ -370,7 +370,7 @@ class Observation:
         STARCENX/Y, else CRPIX1/2 (1-indexed) with the dither behind the mask, XOFFSET and YOFFSET.
         Of spaceKLIP's files also MASKOFFS, the position of the star from the mask, and the shifts
         of aligned frames (IMSHIFTS, or CENTER_SHIFT and ALIGN_SHIFT): they are undone, so that the
-        pixels are those of the detector, whose flat-field errors then stay in their pixels.
+        frames have the pixels of the detector, whose flat-field errors then stay in their pixels.
         Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
         `pyklip_diffrender.scene.integrations.calibrated_errors`. Integrations that are empty are
         left out, and three or more are compared with each other, see
@@ -419,9 +419,9 @@ class Observation:
         Returns
         -------
         Observation
-            One frame for each pointing, see `pointings`; `integrations` says of how many it is the
-            mean, and `noise_ratios` has the ratio of the integration in which it is farthest from
-            one.
+            One frame for each pointing, see `pointings`; `integrations` says how many integrations
+            each frame averages, and `noise_ratios` has the ratio that is farthest from one among
+            them.
 
         Raises
         ------
@@ -462,7 +462,7 @@ class Observation:
             for key in ("data", "error", "valid", "center", "position_angles")
             if getattr(self, key) is not None
         }
-        # The mean of the integrations: each observation counts by the number that it has.
+        # The mean of the integrations: each observation counts by its number of integrations.
         offsets = [each.star_offset for each in every if each.star_offset is not None]
         if len(offsets) == len(every):
             x, y = np.average(offsets, axis=0, weights=[each.count for each in every])
@@ -486,7 +486,7 @@ class Observation:
     def pointings(self) -> tuple[Observation, ...]:
         """Split frames that show the star at different places or orientations.
 
-        Frames of one observation are averaged for a fit. Those whose stars are more than 0.3
+        Frames of one observation are averaged for a fit. Frames whose stars are more than 0.3
         pixels apart, or whose position angles differ by more than 0.05 degrees, are not of one
         pointing.
         """
@@ -511,12 +511,12 @@ class Observation:
 
     @property
     def count(self) -> int:
-        """Number of integrations, also of those that frames are means of."""
+        """Number of integrations, including the ones that frames average."""
         return sum(self.counts)
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Number of integrations that each frame is the mean of; 1 where it is one."""
+        """Number of integrations that each frame averages; 1 where a frame is one integration."""
         return self.integrations or (1,) * len(self)
 
     @property
@@ -552,7 +552,7 @@ class Observation:
 
     @property
     def position_angle(self) -> float:
-        """As `north`, but 0 if it is not known."""
+        """Position angle as `north`, but 0 if it is not known."""
         return self.north or 0.0
 
     def roll_from(self, other: Observation) -> float:
@@ -665,7 +665,7 @@ class Observation:
         Parameters
         ----------
         ax : Axes, optional
-            Default that of a new figure.
+            Default: the axes of a new figure.
         frame : int
 
         Returns
@@ -691,7 +691,7 @@ class Observation:
     def combined(self) -> Observation:
         """Average the frames, each weighted by its inverse median variance.
 
-        Only for frames that see the star at the same place under the same wavefront.
+        The frames must see the star at the same place under the same wavefront.
         """
         data, error, valid = weighted_mean(self.data, self.error, self.valid)
         return replace(

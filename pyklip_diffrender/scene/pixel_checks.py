@@ -27,10 +27,10 @@ _CORE = 1.0
 """Radius, arcsec, in which the light of a star behind a mask is summed."""
 
 _SOFT = 0.2
-"""Half of the width, arcsec, of the edge of that circle."""
+"""Half of the width, arcsec, of the edge of the circle in which light is summed."""
 
 _BEHIND = 0.5
-"""Largest distance, arcsec, of the pattern's centre of symmetry from where the star should be. It
+"""Largest distance, arcsec, of the pattern's centre of symmetry from where the star should be. This
 is measured to half a pixel; stars are put behind the mask to .02 arcsec, and headers may be wrong
 by a few pixels. Half of a star's light passes a mask at 0.4 to 0.8 arcsec from its centre."""
 
@@ -46,16 +46,16 @@ _SOURCE = 0.8
 """Radius, arcsec, in which light is compared with the image of a point source."""
 
 _LIKE_A_SOURCE = 0.79
-"""Least correlation of the square roots. It was 0.88 to 0.98 for sources that hide the star in real
-frames, and at most 0.75 for stars behind the mask."""
+"""Least correlation of the square roots of light and point source. The correlation was 0.88 to 0.98
+for sources that hide the star in real frames, and at most 0.75 for stars behind the mask."""
 
 _SYMMETRIC = 0.7
 """Share of the light of a point source that is symmetric about it, as far as it is used."""
 
 _AS_BRIGHT = 0.12
-"""Contrast from which a source that hides the star is taken for the star itself. It was at most
-0.1 for sources of 0.1 beside real stars, and 0.14 or more for a star 1.5 arcsec off the mask; a
-displacement of 1.2 arcsec and less cannot be told from such a source."""
+"""Contrast above which a source that hides the star is taken for the star itself. The contrast was
+at most 0.1 for sources of 0.1 beside real stars, and 0.14 or more for a star 1.5 arcsec off the
+mask; a displacement of 1.2 arcsec and less cannot be told from such a source."""
 
 _AROUND, _VALID = 2.0, 0.75
 """Radius, arcsec, and the least share of valid pixels within it. The share is 0.999 in real frames,
@@ -69,7 +69,7 @@ _FACTOR = 1.5
 behind the mask. The ratio of rolls was at most 1.05 for the real stars at hand."""
 
 _COPY = 0.95
-"""Correlation of the noise of two frames above which they are one. Flat-field errors correlate the
+"""Correlation of two frames' noise above which they are one frame. Flat-field errors correlate the
 frames of different stars by up to 0.6."""
 
 _SAME_NOISE = 0.3
@@ -93,8 +93,8 @@ _TURNED = 0.1
 correlate by 0.99, mirrored or turned ones by 0.2 to 0.7."""
 
 _ALONE = 0.15
-"""Distance, arcsec, between the centres of all light and of the star's pattern beyond which the
-light is also that of another source."""
+"""Distance, arcsec, between the centres of all light and of the star's pattern beyond which another
+source contributes to the light."""
 
 _ALIKE = 0.8
 """Least correlation of a pattern with another when it is turned back."""
@@ -133,7 +133,7 @@ def why_few_pixels(observation: Observation) -> str:
 
 
 def not_judged(observation: Observation) -> str:
-    """Say what is not known of frames that are too small to judge, see `why_no_star`."""
+    """Remark on frames that are too small to judge, see `why_no_star`; empty for others."""
     if _stamp(observation) is not None:
         return ""
     return (
@@ -145,8 +145,8 @@ def not_judged(observation: Observation) -> str:
 def why_no_star(observation: Observation) -> str:
     """Why these cannot be frames of a star behind the mask; empty if they can.
 
-    They are compared with the model where another source hides the star. Frames that are too small
-    (1.2 arcsec about the star) are not judged.
+    Frames are compared with the model where another source hides the star. Frames that are too
+    small (1.2 arcsec about the star) are not judged.
     """
     stamp = _stamp(observation)
     if stamp is None:
@@ -170,10 +170,10 @@ def why_no_star(observation: Observation) -> str:
         )
     # The diffraction pattern of a star is nearly symmetric about the star. Where another source is
     # so bright that the centre of all light is elsewhere, the pattern about the star's position
-    # decides, in which a point source is a small part. Where the source hides that, too, it is
-    # compared with the model's image of a point source. What does not look like one is a star's
-    # pattern in the wrong place. A source next to which there is less light behind the mask than
-    # that of a star ten times as bright is the star itself, off the mask.
+    # decides, in which a point source is a small part. Where the source hides the pattern, too, it
+    # is compared with the model's image of a point source. What does not look like one is a star's
+    # pattern in the wrong place. A source is the star itself, off the mask, if there is less light
+    # behind the mask than a star ten times as bright as the source would leave there.
     scale = observation.pixelscale
     away = center_of_symmetry(light) * scale
     if np.hypot(*away) <= _BEHIND:
@@ -303,7 +303,7 @@ def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
 
 
 def why_turned(observations: Sequence[Observation]) -> dict[int, str]:
-    """Find frames of one set-up whose pixels are mirrored or turned, unlike those of most others.
+    """Find frames of one set-up whose pixels are mirrored or turned, unlike most other frames.
 
     The result has reasons by index. Where half of the frames or more have one, nothing says which
     are right. Frames that are too small, or that show another source as bright as the star behind
@@ -319,8 +319,8 @@ def why_turned(observations: Sequence[Observation]) -> dict[int, str]:
             if j != k and operation:
                 different[k].append(operation)
     return {
-        k: f"its pixels are {operations[0]}: the diffraction pattern of the star is that of the "
-        "other frames when this is undone. Use the file as MAST delivers it"
+        k: f"its pixels are {operations[0]}: once this is undone, the star's diffraction pattern "
+        "is as in the other frames. Use the file as MAST delivers it"
         for k, operations in different.items()
         if 2 * len(operations) > len(patterns) - 1
     }

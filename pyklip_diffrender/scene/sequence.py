@@ -39,7 +39,7 @@ from pyklip_diffrender.scene.observation import Observation, Window
 # The table of admission: one row for each file, what it is used for, and what it is.
 
 OF_ANOTHER_EPOCH = "of another epoch than the target, whose wavefront is another one"
-"""Why a frame of a reference star takes no part in the fit of the wavefront."""
+"""Remark on a frame of a reference star that takes no part in the fit of the wavefront."""
 
 SHORT = ("use", "star", "date", "position_angle", "integrations", "file")
 """Columns for a screen."""
@@ -129,8 +129,8 @@ class Sequence:
     science : tuple of Observation
         One for each roll or pointing of the target, in order of time.
     references : tuple of Observation
-        Frames of other stars through the same coronagraph, in order of time: those of `same_epoch`
-        and `other_epochs`.
+        Frames of other stars through the same coronagraph, in order of time, of `same_epoch` and
+        `other_epochs`.
     excluded : tuple of (str, str)
         Names of the files that were left out, and why.
     rows : tuple of Row
@@ -214,13 +214,13 @@ class Sequence:
             programme.
         star : tuple of float, optional
             x, y of the target's star in its files, pixels from 0, in place of what the headers
-            say. The files are then not judged by whether their light is that of a star there. For
-            frames in which something else is brighter than the star behind the mask.
+            say. Whether the files have a star's light there is then not judged. For frames in which
+            something else is brighter than the star behind the mask.
 
         Returns
         -------
         Sequence
-            `table` lists all files, what they are used for and why.
+            The sequence; its `table` lists all files, what they are used for and why.
 
         Raises
         ------
@@ -286,7 +286,7 @@ class Sequence:
         """Sort files as `from_files` does, into one sequence for each epoch.
 
         Frames of the target more than 5 days apart belong to different epochs. Reference stars go
-        with all of them: for the wavefront with those within 5 days, else for the flat-field
+        with all epochs: for the wavefront with epochs within 5 days, else for the flat-field
         pattern and KLIP.
 
         Returns
@@ -308,7 +308,7 @@ class Sequence:
     ) -> tuple[Sequence, ...]:
         """Sort files into one sequence for each filter and epoch of the target.
 
-        Arguments are those of `by_epoch`; with `filter` there is one filter.
+        For the arguments see `by_epoch`; with `filter` there is one filter.
 
         Returns
         -------
@@ -338,7 +338,7 @@ class Sequence:
     def _by_epoch(
         cls, admission: Admission, target: str | None, filter: str | None
     ) -> tuple[Sequence, ...]:
-        """Sort files of which some are left out already."""
+        """Sort files, some of which are left out already."""
         choose_filter(admission, filter)
         star, stars = choose_target(admission, target)
         science, *others = stars.pop(star), *stars.values()
@@ -372,7 +372,7 @@ class Sequence:
         admission: Admission,
         stars: Mapping[FrameFile, str],
     ) -> Sequence:
-        """Make the sequence of one epoch, of which `chosen` are the target's frames."""
+        """Make the sequence of one epoch; `chosen` are the target's frames."""
         dates = [each.exposure.date for each in chosen if each.exposure.date is not None]
         rows, excluded = [], []
         used: dict[str, list[Observation]] = {"target": [], "reference": []}
@@ -391,7 +391,7 @@ class Sequence:
             for part in () if observation is None else observation.pointings():
                 part = replace(part, reference=use == "reference")
                 used[use].append(part)
-                # Segments are files of one exposure, which has no number of a segment in its name.
+                # Segments are files of one exposure, whose name has no segment number.
                 exposures[part.name] = re.sub(r"-seg\d+", "", each.exposure.identity or part.name)
                 remarks = list(part.remarks)
                 if not _is_near(each.exposure.date, dates):
@@ -416,7 +416,7 @@ class Sequence:
 
     @property
     def other_epochs(self) -> tuple[Observation, ...]:
-        """The other frames of reference stars, which have another wavefront."""
+        """Frames of reference stars that have another wavefront than the target's frames."""
         return tuple(each for each in self.references if not _is_near(each.date, self._dates))
 
     @property
@@ -459,7 +459,7 @@ class Sequence:
         for k, place in enumerate(places):
             if first is None or place is None:
                 continue
-            # How far the first pixel of the first window on the detector is from that of this one.
+            # Distance on the detector from this window's first pixel to the first window's.
             x, y = first - place
             if max(abs(x), abs(y)) <= _NEARLY_THE_SAME:
                 windows[k] = Window(windows[k].y + int(y), windows[k].x + int(x), shape)
@@ -541,7 +541,7 @@ def _usable(
     target: str | None = None,
     filter: str | None = None,
 ) -> Admission:
-    """Files of which those that cannot be used are left out.
+    """Files without the ones that cannot be used.
 
     With a `filter`, its frames are read at once, unless the place of their star is still to come.
     """

@@ -53,7 +53,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     Parameters
     ----------
     observation : Observation
-        The model has its filter, and as many pupil samples as its width asks for.
+        The model has the observation's filter, and as many pupil samples as its width asks for.
     size : int, optional
         Side of the detector in pixels, for an observation that will be cut out; default the shape
         of the observation.
@@ -185,7 +185,7 @@ def pupil_samples(
 ) -> int:
     """Pupil samples, `npix` or twice, four times ... as many, for images (ny, nx) behind a mask.
 
-    `place` is that of the star, by default the one of the observation's header.
+    `place` is the star's, by default from the observation's header.
     """
     period, (x, y) = 0.0, observation.pixelscale
     if place is None and observation.is_nircam:
@@ -278,14 +278,14 @@ def simulate(
     opd : array, Quantity or OPDMap
         The true wavefront, (npix, npix), m.
     seed : int
-        Of the noise; the same seed gives the same frames.
+        Seed of the noise; the same seed gives the same frames.
     frames : int
         Independent exposures of the same scene.
 
     Returns
     -------
     Observation
-        In photons. The error is the observer's estimate, sqrt(counts + read noise^2), from
+        Frames in photons. The error is the observer's estimate, sqrt(counts + read noise^2), from
         the frame itself.
 
     Examples

@@ -18,14 +18,14 @@ _SKY = 3.0
 """arcsec from the star beyond which the background is measured."""
 
 _ENOUGH = 2000
-"""Least number of pixels for that; with fewer, it is the faintest fifth of all."""
+"""Least number of pixels for the background; with fewer, it is the faintest fifth of all."""
 
 _RING, _ENOUGH_OF_RING = 1.8, 300
 """Distance, arcsec, and number of pixels of a ring about the star, whose darkest quarter is no
 darker than the background."""
 
 _INNER, _OUTER, _CONCENTRATED = 1.0, 2.0, 5.0
-"""Ratio of the light within 1 arcsec and beyond 2 arcsec from which an image is that of a star."""
+"""Ratio of the light within 1 arcsec and beyond 2 arcsec above which an image shows a star."""
 
 _SEEN = 3.0
 """S/N of the pixels that are looked at."""
@@ -35,12 +35,12 @@ _PATTERN = 1.2
 `center_of_pattern`."""
 
 _AGREE = 0.05
-"""Difference, arcsec, between the centres of all light and of that near the star beyond which
+"""Difference, arcsec, between the centres of all light and of the light near the star beyond which
 another source contributes to them."""
 
 _NEAR = 0.5
-"""Largest distance, arcsec, of a star from its stated place that its light tells from that of
-another source."""
+"""Largest distance, arcsec, of a star from its stated place at which its light can be told from
+another source's."""
 
 
 def stamp_about(
@@ -120,10 +120,10 @@ def center_of_pattern(image: Image, distance: Image) -> Image:
 def measured_offset(
     data: Image, error: Image, valid: NDArray[np.bool_], center: Image, pixelscale: float
 ) -> Image | None:
-    """How far a star is from where it is said to be, x, y in pixels, (2,); see `stamp_about`.
+    """Offset of a star from its stated place, x, y in pixels, (2,); see `stamp_about`.
 
-    None if the image is too small, is not that of a star, or is also that of another source whose
-    light cannot be told from the star's.
+    None if the image is too small, shows no star, or also shows another source whose light cannot
+    be told from the star's.
     """
     stamp = stamp_about(data, error, valid, center, pixelscale)
     if stamp is None:

@@ -80,8 +80,8 @@ def _star_from(facts: dict[str, Any]) -> CatalogueStar:
 # Whether something that was learned from frames is for other frames.
 
 HALF_COVERED = 0.5
-"""Smallest part of a frame's pixels that a pattern must cover to be chosen; one that was given and
-covers less has a remark."""
+"""Smallest part of a frame's pixels that a pattern must cover to be chosen; a given pattern that
+covers less gets a remark."""
 
 # `learned` is a pattern or the fit of a reference star: it has filter, image_mask, detector and
 # flat, None where not known, and stars and names of frames.
@@ -95,14 +95,14 @@ def shows_star(learned: Any, observation: Observation) -> bool:
         for star in learned.stars
     ):
         return True
-    # A header without a star, and a name that somebody has given: of a file, usually.
+    # A header without a star, and a name that somebody has given, usually the name of a file.
     return observation.name != Observation.name and observation.name in learned.frames
 
 
 def _aspects(
     learned: Any, observation: Observation
 ) -> tuple[tuple[str, str | None, str | None], ...]:
-    """Names of the properties that have to agree, each as learned and as of the observation."""
+    """Names of the properties that have to agree, each as learned and as observed."""
     header, name = observation.header, observation.name
     return (
         ("filter", learned.filter, observation.filter),
@@ -141,9 +141,9 @@ def unrecorded(learned: Any, observation: Observation) -> list[str]:
 
 
 def caveat(systematics: Systematics, observation: Observation) -> str:
-    """What speaks against relying on a pattern that is used; empty if nothing does.
+    """Reasons against relying on a pattern that is used; empty if there are none.
 
-    It is said of patterns with values: one of which only the size is known is of the frames.
+    Only patterns with values have reasons: where the size alone is known, it is the frames' own.
     """
     if not systematics.pattern.any():
         return ""
@@ -159,9 +159,9 @@ def caveat(systematics: Systematics, observation: Observation) -> str:
 
 
 def require_pattern_of(systematics: Systematics, observation: Observation) -> None:
-    """Raise IncompatibleSetupError for a pattern that cannot be that of an observation's pixels.
+    """Raise IncompatibleSetupError for a pattern that an observation's pixels cannot have.
 
-    It is refused for another filter, mask or detector, where it covers no pixel, and if it was
+    A pattern is refused for another filter, mask or detector, if it covers no pixel, and if it was
     learned from the star of the observation.
     """
     name = f"systematics: the pattern {systematics.name!r}"
@@ -203,7 +203,7 @@ class Systematics:
     pattern : ndarray, (ny, nx)
         Residual over star.
     error : ndarray, (ny, nx)
-        Its standard deviation.
+        Standard deviation of the pattern.
     center : tuple of float
         x, y of the star in the pattern, 0-indexed pixels.
     unknown : float
@@ -211,21 +211,21 @@ class Systematics:
     pedestal : float
         Constant, in the unit of the frames, that is added to the star before the pattern
         multiplies it. A fit starts from it, and has a free pedestal in every frame. It stands for
-        what a fixed pattern leaves far from the star: that of the flat field in the thermal
-        background, which was subtracted as if the flat field were perfect, and that of the dark
-        current.
+        what fixed patterns leave far from the star: the pattern of the flat field in the thermal
+        background, which was subtracted as if the flat field were perfect, and the pattern of the
+        dark current.
     first_pixel : tuple of int or None
         Column and row of the pattern's first pixel on the full detector, as of an `Observation`.
     filter, image_mask, detector : str or None
-        Set-up that it is for; None where it is not known.
+        Set-up of the pattern; None where it is not known.
     flat : str or None
-        Flat field with which the frames were calibrated that it was learned from (R_FLAT).
+        Flat field with which the frames of the pattern were calibrated (R_FLAT).
     catalogue : tuple of CatalogueStar
-        Names and coordinates of the stars that it was learned from.
+        Names and coordinates of the stars that the pattern was learned from.
     name : str
         Short label for headers.
     provenance : dict
-        Frames it was learned from, and how.
+        Frames that the pattern was learned from, and how.
 
     Examples
     --------
@@ -263,14 +263,14 @@ class Systematics:
 
     @property
     def stars(self) -> tuple[CatalogueStar, ...]:
-        """The stars that it was learned from; by name alone where no catalogue is known."""
+        """Stars that the pattern was learned from; by name alone where no catalogue is known."""
         return self.catalogue or tuple(
             CatalogueStar((str(name),)) for name in self.provenance.get("stars", ())
         )
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Names of the frames that it was learned from."""
+        """Names of the frames that the pattern was learned from."""
         return tuple(self.provenance.get("frames", ()))
 
     def to_hdus(self) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Wavefront maps, the modes that describe their changes, and priors on those."""
+"""Wavefront maps, the modes that describe their changes, and priors on the modes."""
 
 from __future__ import annotations
 

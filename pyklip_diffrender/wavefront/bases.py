@@ -128,7 +128,7 @@ class FourierModes:
     groups = ("texture",)
 
     amplitude = math.sqrt(2)
-    """Of the cosines and sines, whose rms is 1."""
+    """Amplitude of the cosines and sines, whose rms is 1."""
 
     def __init__(self, max_cycles: float = 24.0, min_cycles: float = 0.5) -> None:
         # MASKRND's narrow openings spread light over 11 lambda/D, so a field of 5 arcsec at 4.5 um
@@ -238,9 +238,9 @@ def fourier_part(basis: Basis) -> tuple[int, FourierModes] | None:
 
 
 def default_basis(max_cycles: float = 24.0, pupil: EntrancePupil | None = None) -> Basis:
-    """Return the wavefront modes, up to `max_cycles` across the pupil, of a fit without any given.
+    """Return the default wavefront modes of a fit, up to `max_cycles` across the pupil.
 
-    For JWST, the default, they are segment motions and Fourier modes, 1,846 modes up to 24 cycles.
+    JWST, the default, has segment motions and Fourier modes, 1,846 modes up to 24 cycles.
     Other telescopes (see `is_jwst_pupil`) get the Fourier modes alone, whatever their segments are.
     """
     fourier = FourierModes(max_cycles)

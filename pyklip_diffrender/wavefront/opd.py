@@ -110,7 +110,7 @@ def read_opd(
             "folder that is nearest to a date"
         )
     if not path.exists():
-        raise MissingFileError(f"{path}: no such file, expected that of a wavefront map")
+        raise MissingFileError(f"{path}: no such file, expected a wavefront map")
     with open_fits(path) as hdus:
         if extension is None and EXTENSION in hdus:
             return _checked(load_wss_opd(path))
@@ -183,7 +183,7 @@ def _require_wavefront(
 ) -> None:
     """Raise for an image that is constant in the pupil, such as a mask."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or not values.size:
-        return  # `_checked` says that.
+        return  # `_checked` raises for it.
     inside = values[_inside(len(values)) & np.isfinite(values)]
     different = np.unique(inside)
     # A mask with struts and gaps of its own has two values inside the pupil.
@@ -237,7 +237,7 @@ def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
     npix : int
         Samples across the pupil. The same seed gives the same wavefront at any sampling.
     rms : float or Quantity
-        Over the pupil, m.
+        Rms over the pupil, m.
 
     Returns
     -------
@@ -281,7 +281,7 @@ def _random(seed: int, npix: int, rms: float, segment_variance: float, name: str
         opd = opd - (weight * opd).sum()
         return opd / torch.sqrt((weight * opd**2).sum())
 
-    # Both have the variance 1, so that the squares of the factors are their shares of the sum's.
+    # Both have the variance 1, so that the squares of the factors are their shares of the total.
     rigid, inner = (normalised(part) for part in parts)
     mixed = math.sqrt(segment_variance) * rigid + math.sqrt(1 - segment_variance) * inner
     data = (rms * normalised(mixed) * (pupil > 0)).numpy()
@@ -308,10 +308,10 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     ----------
     folder : path
         Wavefront-sensing files of MAST, stpsf's files and other maps may be mixed. The date of a
-        map is that of its header, else the one in the file's name. Files that are not wavefront
-        maps, and maps without a date, are skipped with a message to the log. So are those that
-        stpsf leaves out: analyses with known faults, and sensing in F187N. Of several analyses of
-        one sensing the last is used.
+        map is in its header, else in the file's name. Files that are not wavefront maps, and maps
+        without a date, are skipped with a message to the log. So are the maps that stpsf leaves
+        out: analyses with known faults, and sensing in F187N. Of several analyses of one sensing
+        the last is used.
     date : str (ISO, UTC) or Time
         When the frames were taken.
     rule : "nearest", "before", "after" or "interpolate"
@@ -321,8 +321,8 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     Returns
     -------
     OPDMap
-        Its `history` says how many days lie between the map and the date, and which earlier
-        analyses it replaces.
+        The map; its `history` says how many days lie between the map and the date, and which
+        earlier analyses it replaces.
 
     Raises
     ------
@@ -359,7 +359,7 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
             f"{when.isot[:19]}; the {len(maps)} maps are of {min(maps)[0].isot[:10]} to "
             f"{max(maps)[0].isot[:10]}. The rule 'nearest' takes one of them"
         )
-    # Once if a map is of exactly that date.
+    # A map of exactly that date is taken once.
     paths = [path for _, path in sorted(set(filter(None, wanted)))]
     chosen = [read_opd(path) for path in paths]
     notes = [f"{opd.name}, {opd.age(when)}" for opd in chosen]
@@ -381,7 +381,7 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
 def _last_analyses(
     maps: list[tuple[Time, Path]],
 ) -> tuple[list[tuple[Time, Path]], dict[Path, list[str]]]:
-    """Maps without those of which there is a later analysis, and the names that each replaces.
+    """Maps that have no later analysis, and the names of the maps that each replaces.
 
     Maps of one moment to the second are of one sensing, whatever the order of the files.
     """

@@ -40,7 +40,7 @@ class OPDMap:
     history : tuple of str
         Processing steps on reading.
     path : Path or None
-        File that it was read from.
+        File that the map was read from.
     """
 
     data: NDArray[np.float64] = field(repr=False)
@@ -60,11 +60,11 @@ class OPDMap:
         return self.data.shape
 
     def days_after(self, date: str | Time) -> float | None:
-        """Days from `date` (UTC) to the sensing of the map; None if its date is not known."""
+        """Days from `date` (UTC) to the sensing of the map; None if the map has no date."""
         return None if self.date is None else float((self.date - Time(date)).jd)
 
     def age(self, date: str | Time) -> str:
-        """`days_after` in words, such as "3.2 days before"; empty if its date is not known."""
+        """Text for `days_after`, such as "3.2 days before"; empty if the map has no date."""
         days = self.days_after(date)
         return "" if days is None else f"{abs(days):.1f} days {'after' if days > 0 else 'before'}"
 
@@ -98,8 +98,8 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
     if rms > LARGEST_RMS:
         raise UnitError(
             f"{name}: {rms:.3g} m rms inside the pupil, more than several wavelengths. Maps must "
-            "be in metres; those of the wavefront-sensing software are in microns. Give it as a "
-            "Quantity, or set BUNIT in the file"
+            "be in metres; maps of the wavefront-sensing software are in microns. Give the map as "
+            "a Quantity, or set BUNIT in the file"
         )
     filled = (opd != 0) & np.isfinite(opd)
     if filled.all() or not filled.any():

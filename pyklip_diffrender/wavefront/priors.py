@@ -232,7 +232,7 @@ def learn_prior(
 def _invert_lower(factor: Tensor) -> Tensor:
     """Inverse of a lower triangle, in half the time of solving for the identity.
 
-    Takes its place where its columns are contiguous, as those of torch's Cholesky factors are.
+    It replaces `factor` in memory where columns are contiguous, as in torch's Cholesky factors.
     """
     inverse, failure = dtrtri(factor.numpy(), lower=1, overwrite_c=1)
     assert not failure, "a Cholesky factor has no zero on its diagonal"
@@ -257,9 +257,9 @@ def solve_with_evidence(
     `curvature` is G^T G of the whitened Jacobian, (n, n), float64, the wavefront modes last, and
     `gradient` G^T of the whitened residual at zero, (n,). `shape` and `group` are the relative
     prior deviation and the group of every mode, `scales` the starting scales of the groups, and
-    `fixed_deviation`, (n - modes,), those of the parameters before the modes, inf without a prior.
-    `iterations` is the number of updates of the scales; `damping` that of steps from `current`,
-    (n,), as a multiple of the prior's penalty.
+    `fixed_deviation`, (n - modes,), the prior deviations of the parameters before the modes, inf
+    without a prior. `iterations` is the number of updates of the scales; `damping` is the penalty
+    on steps from `current`, (n,), as a multiple of the prior's penalty.
     """
     # With the prior's precision P and the damping d of steps from x0 (Levenberg-Marquardt), the
     # step x minimises |r - G x|^2 + x P x + d (x - x0) P (x - x0):
@@ -308,7 +308,7 @@ def scale_ratios(step: Tensor, variance: Tensor, deviation: Tensor, group: Tenso
     """Size of the modes of each group relative to their prior, (groups,).
 
     Most probable values, their variance and the prior's deviation are (modes,), as is `group`.
-    Above 1 for a prior that is too narrow; 1 for groups with too few determined modes.
+    A size above 1 says that the prior is too narrow; groups with too few determined modes have 1.
     """
     # At the scales of the highest evidence, the sum of (step / deviation)^2 is the number of modes
     # that the data determine.

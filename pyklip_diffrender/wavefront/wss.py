@@ -2,8 +2,8 @@
 
 The steps are the same as in stpsf's `load_wss_opd`: fill the gaps, interpolate, convert microns,
 mask, and subtract the internal aberration of the sensing camera and the telescope's field
-dependence, both at the sensing field point. The last two come from that function, and the others
-also work without stpsf.
+dependence, both at the sensing field point. The subtracted terms come from stpsf, and the other
+steps also work without it.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def finest_pupil() -> int:
 
 
 def pupil_samples(npix: int, required: bool) -> Array:
-    """1 inside the pupil: that of stpsf's data if available, otherwise of the embedded outlines."""
+    """The pupil, 1 inside: from stpsf's data if available, otherwise from the embedded outlines."""
     folder = _data_folder()
     for ending in ("fits.gz", "fits"):
         path = None if folder is None else folder / f"jwst_pupil_RevW_npix{npix}.{ending}"
@@ -124,11 +124,11 @@ _INVALID = ("R2022083106",)
 """Analyses with known faults (stpsf 2.2, ``mast_wss.deduplicate_opd_table``)."""
 
 _F187N = ("02106", "0210E", "03109", "0310H", "04109", "0410H")
-"""Activities of visits that sense in F187N as well, in which NIRCam's focus is another one than in
-F212N, of which the sensing terms are (stpsf 2.2, ``mast_wss.infer_pre_or_post_correction``)."""
+"""Activities of visits that sense in F187N as well. NIRCam's focus is another one there than in
+F212N, for which the sensing terms are (stpsf 2.2, ``mast_wss.infer_pre_or_post_correction``)."""
 
 _NEVER_F187N = ("V01163111001", "V01445")
-"""Visits, or their beginnings, to which that does not apply (ibid.)."""
+"""Visits, or beginnings of their names, that never sense in F187N (ibid.)."""
 
 _NAME = re.compile(r"([A-Z]\d{10})-\w+?-(\d+)(?=\.|$)")
 """Correction and number of the analysis in the name of a file of MAST."""
@@ -145,7 +145,7 @@ def analysis_of(name: str) -> tuple[str, int]:
 
 
 def why_not_sensed_well(correction: str, observation: str) -> str:
-    """Why a measurement is not used where there are others; empty for those that are.
+    """Why a measurement is not used where there are others; empty if it is used.
 
     `correction` is such as "R2022083106" (CORR_ID), `observation` the identifier of the exposure
     (OBS_ID), which ends in the activity. stpsf leaves the same ones out of its tables.
@@ -172,7 +172,7 @@ def load_wss_opd(
         File as MAST has it, such as ``R2022081102-NRCA3_FP1-1.fits``.
     npix : int, optional
         Samples across the map. To subtract the sensing terms, stpsf's data must include a pupil
-        with as many. Default that of the finest pupil in stpsf's data, else 1024.
+        with as many. Default as in the finest pupil of stpsf's data, else 1024.
     backout_si_wfe : bool, optional
         Subtract the sensing camera's aberration and the telescope's field dependence at the
         sensing field point, with stpsf's models. False keeps the measured sum. By default they
@@ -188,9 +188,9 @@ def load_wss_opd(
     Raises
     ------
     CorruptFileError
-        If it is not a wavefront-sensing file, or stpsf's data are incomplete.
+        If the file is not a wavefront-sensing file, or stpsf's data are incomplete.
     IncompatibleSetupError
-        If its unit is not a length, or stpsf is needed and not installed.
+        If the map's unit is not a length, or stpsf is needed and not installed.
     UnitError, NonFiniteError
         If the values cannot be a wavefront in that unit.
 
@@ -346,9 +346,9 @@ def _names_in_archive(mast_wss: Any, when: Time, choice: str) -> list[str]:
 
 
 def interpolate_wss(before: OPDMap, after: OPDMap, date: str | Time) -> OPDMap:
-    """Interpolate linearly in time between two maps, with a warning: it was not measured.
+    """Interpolate linearly in time between two maps, with a warning that this is no measurement.
 
-    IncompatibleSetupError if a map has no date, or the date is not between theirs.
+    IncompatibleSetupError if a map has no date, or `date` is not between the dates of the maps.
     """
     when = Time(date)
     if before.date is None or after.date is None:
