@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
-from pyklip_diffrender.scene.jwst_files import mask_place
+from pyklip_diffrender.scene.aligned_frames import mask_place
 
 ARCSEC = np.deg2rad(1 / 3600)
 """rad."""
