@@ -101,7 +101,7 @@ def filter_bandpass(
     if nlambda < 1:
         raise ValueError(f"nlambda: got {nlambda}, expected at least 1")
     wavelength, throughput = filter_throughput(name)
-    # Intervals are between the wavelengths at which the throughput is 1 % of its peak; those
+    # Intervals are between the wavelengths at which the throughput is 1 % of its peak; intervals
     # without light are omitted. Every wavelength is the photon-weighted mean of its interval, for
     # the best accuracy with few wavelengths.
     # The table has few points, so the throughput is interpolated to find where it passes 1 %.

@@ -41,7 +41,7 @@ def same_name(first: str | None, second: str | None) -> bool:
 
 
 def unknown_name(key: str, choice: str, names: Iterable[str | None]) -> IncompatibleSetupError:
-    """Error for a name that is not among those there are, with the one that may be meant."""
+    """Error for a name that is not among the known names, with the name that may be meant."""
     known = sorted({str(name) for name in names})
     # Another number is another star, however alike the names are.
     by_plain = {_plain(name): name for name in known if _alike_numbers(choice, name)}

@@ -464,7 +464,7 @@ def _fit_references(
     map_for: Callable[[Time | None], OPDMap],
     common: dict[str, Any],
 ) -> tuple[list[Refinement], list[tuple[str, str]]]:
-    """Fit every reference star at each epoch; also the names of those that fail, and why."""
+    """Fit every reference star at each epoch; also the names of stars that fail, and why."""
     fits, failed = [], []
     for star, frames in _by_star(references).items():
         epochs = epochs_of([each.date for each in frames])

@@ -117,8 +117,8 @@ def breakdown_explained(name: str) -> Iterator[None]:
         yield
     except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
         raise RefinementError(
-            f"{name}: the fit broke down, as it does where the frames show something else than the "
-            f"star that the model renders. {WHAT_TO_CHECK} ({error})"
+            f"{name}: the fit broke down, as it does where the frames show something other than "
+            f"the star that the model renders. {WHAT_TO_CHECK} ({error})"
         ) from error
 
 
@@ -692,7 +692,7 @@ class Refinement:
         ax : three Axes, optional
             Default: the axes of a new figure.
         frame : int
-            Which of `frames`; the integrations of an observation are averaged.
+            Index of the frame in `frames`; the integrations of an observation are averaged.
 
         Returns
         -------

@@ -780,7 +780,7 @@ class Solver:
             equations = None if is_new else self.equations.preconditioner(state, kappa, modes)
             if equations is None:
                 equations = self.equations.about(state, kappa, modes, objective.robust, ACCURATE)
-            # Frames of reference stars, of which there may be many, hardly change the direction.
+            # Frames of reference stars, perhaps many, hardly change the direction.
             rough = {
                 k: equations.frames[k]
                 for k, forward in enumerate(objective.forwards)

@@ -146,7 +146,7 @@ class CatalogueStar:
     coordinates: tuple[float, float] | None = None  # RA and Dec, degrees
     pointing: bool = False  # the coordinates are where the telescope pointed
     motion: tuple[float, float] | None = None  # see `proper_motion`; None also if it cannot be true
-    # Julian years of which the coordinates may be: the catalogue's and the exposure's.
+    # Possible Julian years of the coordinates: the catalogue's and the exposure's.
     epochs: tuple[float, ...] = ()
 
     @property

@@ -1,4 +1,4 @@
-"""Where the star is in an image of it behind a mask, to half a pixel."""
+"""Place of a star in an image behind a mask, to half a pixel."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def center_of_symmetry(image: Image) -> Image:
 
 
 def _vertex(values: Image, peak: int) -> float:
-    """Where the parabola through a maximum and its neighbours is largest, from the maximum."""
+    """Vertex of the parabola through a maximum and its neighbours, relative to the maximum."""
     low, middle, high = values[[peak - 1, peak, (peak + 1) % len(values)]]
     curvature = low - 2 * middle + high
     return float(0.5 * (low - high) / curvature) if curvature < 0 else 0.0
