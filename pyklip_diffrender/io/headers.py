@@ -206,8 +206,8 @@ def day_and_time(header: fits.Header, name: str) -> Time | None:
 def sensing_date(header: fits.Header, name: str) -> Time | None:
     """Date (UTC) at which a wavefront map was sensed, None if it is not known.
 
-    It is DATE-OBS with TIME-OBS, as MAST and stpsf write them, DATE-OBS alone, DATE-BEG, or else
-    the date in the name of the file, `name`. CorruptFileError if the cards do not hold a date.
+    The date is DATE-OBS with TIME-OBS, as MAST and stpsf write them, DATE-OBS alone, DATE-BEG, or
+    else the date in the name of the file, `name`. CorruptFileError if the cards do not hold a date.
     """
     split = day_and_time(header, name)
     if split is not None:

@@ -803,7 +803,7 @@ class Annealing:
     def _stalling(self, course: Course) -> list[Planet]:
         """A companion in the residual of a fit of the wavefront that stalled.
 
-        One at a time, because the side lobes of a bright companion are peaks as well.
+        Companions come one at a time, because side lobes of a bright companion are peaks as well.
         """
         is_hopeless = self._may_add and course.error > _HOPELESS
         if not (self.settings.companions_if_stalled or is_hopeless):

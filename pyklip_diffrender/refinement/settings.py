@@ -134,8 +134,8 @@ class GaussNewton:
         share one wavefront.
     dither_drift : WavefrontPrior, optional
         Prior on the difference between the wavefronts of the frames of one exposure sequence, such
-        as the small-grid dithers of a star. These share a difference of the size of `drift` from
-        frames before or after a slew. By default the wavefronts of any two frames differ by
+        as the small-grid dithers of a star. The sequence shares a difference of the size of `drift`
+        from frames before or after a slew. By default the wavefronts of any two frames differ by
         `drift`.
     drift_cycles : float
         Highest spatial frequency of such differences.
@@ -163,7 +163,7 @@ class GaussNewton:
         The fit has converged when a step lowers the penalised chi-squared per pixel by less.
     min_model_error : float
         Smallest error of the star model that is assumed on the way to the solution, as a fraction
-        of the star's light in a pixel. It is added in quadrature to the noise. The errors of the
+        of the star's light in a pixel, and added in quadrature to the noise. The errors of the
         result do not include it where the noise explains the residual.
     relinearise : float
         Relative error of derivatives (radians of phase, rms over the pupil) beyond which the
@@ -335,7 +335,7 @@ class GaussNewton:
         ratios : mapping of str to float
             As for `with_wider_priors`; ratios of groups of `prior` do not count.
         within : GaussNewton
-            Its drifts are the middle of the bounds, a factor of `_DRIFT_RANGE` to either side.
+            Settings whose drifts are the middle of the bounds, `_DRIFT_RANGE` times to either side.
             Dithers may differ by as much as exposures with a slew between them.
         """
         changed = {}

@@ -447,8 +447,8 @@ def position_angle(header: fits.Header, name: str) -> float | None:
 def beginning(header: fits.Header, name: str) -> Time | None:
     """Beginning of an exposure, UTC; None if the header does not say.
 
-    It is DATE-BEG, DATE-OBS with TIME-OBS, EXPSTART, or the day of DATE-OBS alone. CorruptFileError
-    if a card does not hold a date.
+    The date is DATE-BEG, DATE-OBS with TIME-OBS, EXPSTART, or the day of DATE-OBS alone.
+    CorruptFileError if a card does not hold a date.
     """
     dates = header_date(header, ("DATE-BEG",), name), day_and_time(header, name)
     date = next((each for each in dates if each is not None), None)

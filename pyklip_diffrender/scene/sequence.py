@@ -127,7 +127,7 @@ class Sequence:
     target : str
         Name of the target.
     science : tuple of Observation
-        One for each roll or pointing of the target, in order of time.
+        Frames of the target, one observation for each roll or pointing, in order of time.
     references : tuple of Observation
         Frames of other stars through the same coronagraph, in order of time, of `same_epoch` and
         `other_epochs`.

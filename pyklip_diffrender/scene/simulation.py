@@ -201,7 +201,7 @@ def images_of_stars(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Images, (n, n), of a star behind the mask and of one `away` from it (arcsec, in y).
 
-    They are monochromatic, with an arbitrary wavefront, and show `reach` (arcsec) about both.
+    The images are monochromatic, with an arbitrary wavefront, and show `reach` (arcsec) about both.
     """
     size = 2 * int(np.ceil((away + reach) / np.mean(observation.pixelscale))) + 1
     npix = pupil_samples(observation, (size, size), 128)

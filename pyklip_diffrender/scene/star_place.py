@@ -85,8 +85,8 @@ def without_gaps(image: Image) -> Image:
 def center_of_symmetry(image: Image) -> Image:
     """x, y from the middle, (2,), in pixels, of the point about which an image is most symmetric.
 
-    The image is (n, n) with n odd; negative pixels count as 0. It is good to a tenth of a pixel for
-    stars on real frames.
+    The image is (n, n) with n odd; negative pixels count as 0. The point is good to a tenth of a
+    pixel for stars on real frames.
     """
     # The convolution of the image with itself at 2 c, sum over x of f(x) f(2 c - x), compares it
     # with itself turned by 180 degrees about c; it is largest where these are most alike.

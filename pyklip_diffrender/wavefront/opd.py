@@ -60,9 +60,9 @@ def read_opd(
     """Read an OPD map from a FITS file.
 
     Maps of the mission's wavefront sensing from MAST are recognised by their extension
-    RESULT_PHASE. They are in microns without a unit in the header, and contain the aberrations of
-    the sensing camera. These are subtracted with stpsf's models if stpsf and its data are
-    installed; otherwise they are kept, with a warning. See ``wss.load_wss_opd``.
+    RESULT_PHASE. These maps are in microns without a unit in the header, and contain the
+    aberrations of the sensing camera. The aberrations are subtracted with stpsf's models if stpsf
+    and its data are installed, and otherwise kept, with a warning. See ``wss.load_wss_opd``.
 
     Parameters
     ----------

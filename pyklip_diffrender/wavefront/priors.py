@@ -232,7 +232,7 @@ def learn_prior(
 def _invert_lower(factor: Tensor) -> Tensor:
     """Inverse of a lower triangle, in half the time of solving for the identity.
 
-    It replaces `factor` in memory where columns are contiguous, as in torch's Cholesky factors.
+    The inverse overwrites `factor` if its columns are contiguous, as in torch's Cholesky factors.
     """
     inverse, failure = dtrtri(factor.numpy(), lower=1, overwrite_c=1)
     assert not failure, "a Cholesky factor has no zero on its diagonal"
