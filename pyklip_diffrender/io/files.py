@@ -225,7 +225,7 @@ def _require_sound(hdu: Any, number: int, path: Path, file: BinaryIO) -> None:
     if stated and stated != str(of_data):
         raise CorruptFileError(
             f"{path}: the data of extension {number} do not have the checksum in its header "
-            "(DATASUM). Fetch it again, or delete the card if somebody changed them on purpose"
+            "(DATASUM). Fetch the file again, or delete the card if the data changed on purpose"
         )
     of_header = _ones_complement(file, place["hdrLoc"], place["datLoc"] - place["hdrLoc"])
     # With its CHECKSUM, an HDU sums to -0.

@@ -318,7 +318,7 @@ def _read(path: Path) -> tuple[tuple[MeasuredPattern, ...], QTable]:
             table = QTable.read(hdus["VALIDATION"]) if "VALIDATION" in hdus else QTable()
         except (KeyError, TypeError, ValueError) as error:
             raise CorruptFileError(
-                f"{path}: not a complete library of patterns ({error}). Learn it again"
+                f"{path}: not a complete library of patterns ({error}). Learn the library again"
             ) from error
     return patterns, table
 

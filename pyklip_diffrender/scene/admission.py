@@ -570,5 +570,5 @@ def require_agreement(observations: Sequence[Observation]) -> None:
         raise IncompatibleSetupError(
             f"{', '.join(each.name for each in unknown)}: the orientation on the sky is not known "
             "(ROLL_REF and V3I_YANG of the header, position_angles), and companions rotate with "
-            "it. Add it, or refine one observation alone"
+            "it. Add the orientation, or refine one observation alone"
         )

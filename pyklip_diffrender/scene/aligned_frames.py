@@ -129,8 +129,8 @@ def net_shifts(
     the mask on the detector, (2,), all x, y in pixels. Without a mask, whole pixels are left out.
     """
     # A file records by how much its frames were shifted, but not by how many whole pixels they were
-    # cut or padded afterwards, all alike. The whole pixels follow from the star, which was within half
-    # a pixel of the mask's centre: star = mask + shift + whole pixels + less than a half.
+    # cut or padded afterwards, all alike. The whole pixels follow from the star, which was within
+    # half a pixel of the mask's centre: star = mask + shift + whole pixels + less than a half.
     if mask is None:
         return np.asarray(shifts - np.round(shifts.mean(axis=0)))
     return np.asarray(shifts + np.round(np.median(star - mask - shifts, axis=0)))

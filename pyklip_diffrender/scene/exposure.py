@@ -266,8 +266,8 @@ def common_motion(headers: Iterable[tuple[fits.Header, str]]) -> tuple[float, fl
             raise IncompatibleSetupError(
                 f"the headers disagree on the star's proper motion (MU_RA, MU_DEC, arcsec per "
                 f"year): got {one[0]:g}, {one[1]:g} in {first} and {other[0]:g}, {other[1]:g} in "
-                f"{second}, expected the same to {_SAME_MOTION:g}. Correct them, or give it as "
-                "proper_motion (--proper-motion)"
+                f"{second}, expected the same to {_SAME_MOTION:g}. Correct the headers, or give "
+                "the motion as proper_motion (--proper-motion)"
             )
     if not known:
         return None
