@@ -409,7 +409,7 @@ def as_table(points: Sequence[Point], command: str) -> Table:
 
 def draw(table: Table, what: str) -> Figure:
     """Error against time for one task; a line for each way to do it that a user can choose."""
-    figure = Figure(figsize=(6.2, 4.2), layout="constrained")
+    figure = Figure(figsize=(4.6, 4.2), layout="constrained")
     ax = figure.subplots()
     rows = table[table["what"] == what]
     for way, label in FIGURES[what].items():
@@ -426,7 +426,7 @@ def draw(table: Table, what: str) -> Figure:
     ax.set_xlim(left, right * (right / left) ** 0.25)  # For the labels.
     ax.set(xlabel="time (s)", ylabel=UNITS[what])
     ax.axhline(1.0, color="0.7", lw=1, zorder=0)  # The noise of a pixel.
-    figure.legend(loc="outside upper center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(loc="outside upper center", fontsize=8, frameon=False)
     return figure
 
 

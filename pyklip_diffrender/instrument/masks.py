@@ -37,7 +37,7 @@ class RoundMask:
     sigma: float  # scale of the profile, per arcsec (stpsf 2.2.0, NIRCam_BandLimitedCoron)
 
     stop = "MASKRND"
-    """The Lyot stop that is made for it."""
+    """Lyot stop that is made for the mask."""
 
     @property
     def radius(self) -> float:
@@ -74,7 +74,7 @@ class BarMask:
     longest: float | None = None  # modelled up to this x from the star, arcsec; None is all
 
     stop = "MASKBAR"
-    """The Lyot stop that is made for it."""
+    """Lyot stop that is made for the mask."""
 
     @property
     def reach(self) -> tuple[float, float]:

@@ -101,7 +101,7 @@ def filter_bandpass(
     if nlambda < 1:
         raise ValueError(f"nlambda: got {nlambda}, expected at least 1")
     wavelength, throughput = filter_throughput(name)
-    # Intervals are between the wavelengths at which the throughput is 1 % of its peak; those
+    # Intervals are between the wavelengths at which the throughput is 1 % of its peak; intervals
     # without light are omitted. Every wavelength is the photon-weighted mean of its interval, for
     # the best accuracy with few wavelengths.
     # The table has few points, so the throughput is interpolated to find where it passes 1 %.
@@ -205,7 +205,7 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
         Or spectral type of a dwarf (B5 to M9) and its 2MASS Ks magnitude, such as "A2V, K=6.77".
         From the type, the flux is good to about 5 %.
     filter : str
-        Such as "F444W".
+        Filter, such as "F444W".
 
     Returns
     -------
@@ -557,7 +557,7 @@ def planet_spectra(
         densities, or of surface brightnesses, is a spectrum with the name of the column. Without
         units, wavelengths are in micron and spectra per frequency. Only their shape matters.
     filters : sequence of str
-        Such as "F444W".
+        Filters, such as "F444W".
 
     Returns
     -------

@@ -94,7 +94,7 @@ _PRODUCTS = {
 
 
 def product_in(hdus: fits.HDUList) -> str:
-    """Which product of this package an open file is, such as "a fit"; empty if it is none."""
+    """Name of this package's product in an open file, such as "a fit"; empty for other files."""
     header = hdus[0].header
     if "PATVERS" in header:
         return "a library of flat-field patterns"
@@ -225,7 +225,7 @@ def _require_sound(hdu: Any, number: int, path: Path, file: BinaryIO) -> None:
     if stated and stated != str(of_data):
         raise CorruptFileError(
             f"{path}: the data of extension {number} do not have the checksum in its header "
-            "(DATASUM). Fetch it again, or delete the card if somebody changed them on purpose"
+            "(DATASUM). Fetch the file again, or delete the card if the data changed on purpose"
         )
     of_header = _ones_complement(file, place["hdrLoc"], place["datLoc"] - place["hdrLoc"])
     # With its CHECKSUM, an HDU sums to -0.
@@ -313,7 +313,7 @@ class OutputFolder:
         self._known = stamps(products(self.folder))
 
     def place(self) -> Path:
-        """Return the folder to write to now: a new one if somebody else has written to this one."""
+        """Return the folder to write to now: a new one if somebody else has written to the old."""
         found = stamps(self._products(self.folder))
         if any(self._known.get(path) != stamp for path, stamp in found.items()):
             self.folder, self._known = _new_folder_in(self.asked), {}
@@ -330,7 +330,7 @@ class OutputFolder:
     def replace(self, write: Callable[[Path], Iterable[Path]]) -> list[Path]:
         """Put new products in place of the earlier ones, all of them or none.
 
-        `write` writes them to the folder that it is given, and returns their paths.
+        `write` writes the products to the folder that it is given, and returns their paths.
 
         Warns
         -----
@@ -375,7 +375,7 @@ def stamps(paths: Iterable[Path]) -> dict[Path, tuple[int, int]]:
 
 
 def _new_folder_in(folder: Path) -> Path:
-    """Make a folder in another one, called like it with the first number from 2 that is free."""
+    """Make a folder inside `folder`, with the same name and the first free number from 2 on."""
     number = 2
     while True:
         path = folder / f"{folder.absolute().name}-{number}"
@@ -388,7 +388,7 @@ def _new_folder_in(folder: Path) -> Path:
 
 
 def _move(source: Path, path: Path) -> None:
-    """Replace a file in one step; the new one has the permissions of the old one, if there is."""
+    """Replace a file in one step; the new file has the permissions of the old file, if any."""
     if path.exists():
         shutil.copymode(path, source)
     os.replace(source, path)

@@ -41,7 +41,7 @@ def same_name(first: str | None, second: str | None) -> bool:
 
 
 def unknown_name(key: str, choice: str, names: Iterable[str | None]) -> IncompatibleSetupError:
-    """Error for a name that is not among those there are, with the one that may be meant."""
+    """Error for a name that is not among the known names, with the name that may be meant."""
     known = sorted({str(name) for name in names})
     # Another number is another star, however alike the names are.
     by_plain = {_plain(name): name for name in known if _alike_numbers(choice, name)}
@@ -206,8 +206,8 @@ def day_and_time(header: fits.Header, name: str) -> Time | None:
 def sensing_date(header: fits.Header, name: str) -> Time | None:
     """Date (UTC) at which a wavefront map was sensed, None if it is not known.
 
-    It is DATE-OBS with TIME-OBS, as MAST and stpsf write them, DATE-OBS alone, DATE-BEG, or else
-    the date in the name of the file, `name`. CorruptFileError if the cards do not hold a date.
+    The date is DATE-OBS with TIME-OBS, as MAST and stpsf write them, DATE-OBS alone, DATE-BEG, or
+    else the date in the name of the file, `name`. CorruptFileError if the cards do not hold a date.
     """
     split = day_and_time(header, name)
     if split is not None:

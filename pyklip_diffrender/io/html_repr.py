@@ -16,7 +16,7 @@ def html_summary(
 ) -> str:
     """Summary of an object as HTML, for ``_repr_html_``; facts that are None are left out.
 
-    At most 20 rows of the table are shown, of the `columns` that it has. Everything that is not
+    At most 20 rows of the table are shown, with the `columns` that exist. Everything that is not
     markup is escaped: headers of files may hold anything.
     """
     lines = [f"<div><strong>{escape(title)}</strong>", "<table>"]

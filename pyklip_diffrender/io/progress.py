@@ -99,9 +99,9 @@ def stage(name: str) -> Iterator[None]:
 class ProgressBar:
     """A progress bar that also writes a line to the log now and then, at most one a minute.
 
-    Inside a `stage` the name of the stage is shown in place of `name`. It is on standard error if
-    `shown`. `total` is None for a loop that ends when it has converged. A bar inside another one is
-    not shown, nor logged.
+    Inside a `stage` the name of the stage is shown in place of `name`. The bar is on standard error
+    if `shown`. `total` is None for a loop that ends when it has converged. A bar inside another bar
+    is not shown, nor logged.
     """
 
     def __init__(self, name: str, total: int | None = None, *, shown: bool) -> None:

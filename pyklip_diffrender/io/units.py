@@ -44,7 +44,8 @@ def half_circle(degrees: Angle) -> Angle:
 def rotation_matrix(degrees: float) -> NDArray[np.float64]:
     """Return the matrix (2, 2) that rotates positions (x, y) counter-clockwise, from +x to +y.
 
-    It is multiplied by positions as columns from the left; rows take its transpose from the right.
+    Columns of positions are multiplied by the matrix from the left, rows by its transpose from the
+    right.
     """
     cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[cosine, -sine], [sine, cosine]])
@@ -208,7 +209,7 @@ def unit_of(text: str) -> u.UnitBase | None:
     if scaled or not all(word in known for word in re.findall(words, text)):
         return None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", u.UnitsWarning)  # Of several slashes.
+        warnings.simplefilter("ignore", u.UnitsWarning)  # Warnings of several slashes.
         for form in ("generic", "fits"):
             unit = u.Unit(text, format=form, parse_strict="silent") if text else None
             if unit is not None and not isinstance(unit, u.UnrecognizedUnit):

@@ -287,8 +287,8 @@ def choose_systematics(
 
     "auto", or a `PatternLibrary` to search besides the package's, fits `references`, frames of
     other stars or a function that returns them, only where no library has a pattern; "references"
-    fits them in any case and uses both. Their fits start from `map_for` their date, by default from
-    `opd`. `library` is False for frames that do not show its pattern.
+    fits them in any case and uses both. Fits of references start from `map_for` their date, by
+    default from `opd`. `library` is False for frames that do not show the library's pattern.
     Raises DiffrenderError if frames that have to be moved cannot be fitted; a reference star that
     cannot be fitted is left out.
     """
@@ -464,7 +464,7 @@ def _fit_references(
     map_for: Callable[[Time | None], OPDMap],
     common: dict[str, Any],
 ) -> tuple[list[Refinement], list[tuple[str, str]]]:
-    """Fit every reference star at each epoch; also the names of those that fail, and why."""
+    """Fit every reference star at each epoch; also the names of stars that fail, and why."""
     fits, failed = [], []
     for star, frames in _by_star(references).items():
         epochs = epochs_of([each.date for each in frames])

@@ -88,8 +88,8 @@ def learn_library(
     Parameters
     ----------
     files : path or sequence of path
-        As for `Sequence.from_files`, of any number of stars, epochs, filters and masks. Frames are
-        calibrated (MJy/sr), and say which pixels of the detector they have.
+        Files as for `Sequence.from_files`, of any number of stars, epochs, filters and masks.
+        Frames are calibrated (MJy/sr), and say which pixels of the detector they have.
     opd : path, OPDMap, Quantity, array, "flat" or callable
         The wavefront to start from, as for `reduce`; a function gets the `Sequence` of a star and
         returns its `OPDMap`.

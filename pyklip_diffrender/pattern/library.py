@@ -62,10 +62,10 @@ class PatternLibrary:
     Attributes
     ----------
     patterns : tuple of MeasuredPattern
-        One for each frame.
+        Measured patterns, one for each frame.
     validation : QTable
-        One row for each star and epoch, see `learn_library`; empty for patterns that were not
-        tested on each other.
+        Table with a row for each star and epoch, see `learn_library`; empty for patterns that were
+        not tested on each other.
 
     Examples
     --------
@@ -92,8 +92,8 @@ class PatternLibrary:
 
         The patterns have the detector, mask and filter of the observation, cover at least half of
         its pixels, and are of other stars, so that nothing of the target's planets is among them.
-        They share one flat field: the observation's if there are such patterns, else the flat field
-        of most patterns.
+        The patterns share one flat field: the observation's if a pattern has it, else the flat
+        field of most patterns.
         """
         chosen = [
             pattern
@@ -134,9 +134,9 @@ class PatternLibrary:
 
         Each pattern has the extensions PATTERN and PATTERN_ERROR (NaN where nothing was measured),
         as a `Systematics`, with the star, file, date, detector and flat field in the header, and
-        STAR (the star without the pattern, MJy/sr), if it was kept. They have the number of the
-        pattern as EXTVER, from 1; VALIDATION is a table, and PATVERS in the primary header the
-        version of the layout.
+        STAR (the star without the pattern, MJy/sr), if it was kept. EXTVER is the number of the
+        pattern, from 1; VALIDATION is a table, and PATVERS in the primary header the version of the
+        layout.
 
         Parameters
         ----------
@@ -318,7 +318,7 @@ def _read(path: Path) -> tuple[tuple[MeasuredPattern, ...], QTable]:
             table = QTable.read(hdus["VALIDATION"]) if "VALIDATION" in hdus else QTable()
         except (KeyError, TypeError, ValueError) as error:
             raise CorruptFileError(
-                f"{path}: not a complete library of patterns ({error}). Learn it again"
+                f"{path}: not a complete library of patterns ({error}). Learn the library again"
             ) from error
     return patterns, table
 

@@ -330,8 +330,8 @@ class MeasuredPattern:
         if self.light is None:
             raise IncompatibleSetupError(
                 f"{self.frame}: got a pattern with the pedestal {self.pedestal:.4g}, expected "
-                f"{pedestal:.4g}; it was stored without its star, by which the pedestal could be "
-                "changed. Learn it again"
+                f"{pedestal:.4g}; the pattern was stored without its star, by which the pedestal "
+                "could be changed. Learn the pattern again"
             )
         multiplied = self.light + pedestal
         usable = np.isfinite(self.variance) & (multiplied > 0)

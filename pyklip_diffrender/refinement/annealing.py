@@ -681,7 +681,7 @@ class Annealing:
         return replace(end, carried=replace(end.carried, priors=priors), settings=settings)
 
     def _priors_of(self, settings: GaussNewton, before: ModePriors) -> ModePriors:
-        """The priors of other settings, with the number of modes of those before."""
+        """The priors of other settings, with the number of modes of the priors `before`."""
         return replace(self.solver.priors_of(settings), determined=before.determined)
 
     def _gone_on(self, end: _Fitted, steps: int) -> _Fitted:
@@ -780,7 +780,7 @@ class Annealing:
     def _with_dominant(self, state: State, carried: StepState) -> tuple[State, StepState]:
         """Add a companion that outshines what the mask leaves of the star, if there is one.
 
-        Without it the star's flux would follow the companion's light.
+        Without this companion the star's flux would follow the companion's light.
         """
         error = self.objective.model_error(state)
         if error < _OUTSHONE or self._is_warm or not self._may_add:
@@ -803,7 +803,7 @@ class Annealing:
     def _stalling(self, course: Course) -> list[Planet]:
         """A companion in the residual of a fit of the wavefront that stalled.
 
-        One at a time, because the side lobes of a bright companion are peaks as well.
+        Companions come one at a time, because side lobes of a bright companion are peaks as well.
         """
         is_hopeless = self._may_add and course.error > _HOPELESS
         if not (self.settings.companions_if_stalled or is_hopeless):

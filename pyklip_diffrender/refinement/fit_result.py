@@ -117,8 +117,8 @@ def breakdown_explained(name: str) -> Iterator[None]:
         yield
     except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
         raise RefinementError(
-            f"{name}: the fit broke down, as it does where the frames show something else than the "
-            f"star that the model renders. {WHAT_TO_CHECK} ({error})"
+            f"{name}: the fit broke down, as it does where the frames show something other than "
+            f"the star that the model renders. {WHAT_TO_CHECK} ({error})"
         ) from error
 
 
@@ -211,7 +211,7 @@ class FrameFit:
     def to_ccddata(self) -> CCDData:
         """The frame without its star as astropy's `CCDData`; integrations are averaged.
 
-        It has the world coordinates, the mask and the errors of the frame; see `residual`.
+        The image has the world coordinates, the mask and the errors of the frame; see `residual`.
         """
         frame = self.observation.combined()
         data = frame.data[0] - self.star
@@ -388,7 +388,7 @@ class Refinement:
     Attributes
     ----------
     frames : tuple of FrameFit
-        One for each observation, in the same order.
+        The star in each observation, in the same order.
     initial : OPDMap
         Starting wavefront.
     settings : GaussNewton
@@ -419,7 +419,7 @@ class Refinement:
     stored_linear : LinearModel or None
         The linear model; None if the fit was read from a file without it.
     history : list of dict
-        One entry for each iteration.
+        Course of the fit, one entry for each iteration.
     seconds : float
     catalogue_error : float or None
         Relative error of the star's flux in a catalogue, see `star_flux_error`; None without one.
@@ -499,8 +499,8 @@ class Refinement:
     def wavefront(self) -> Image:
         """The refined wavefront of the first frame, (npix, npix), m, real; see `absorption`.
 
-        It is on the samples of the model's pupil. Together with the absorption, it is
-        ``frames[0].opd``.
+        Its samples are the samples of the model's pupil. ``frames[0].opd`` is this wavefront
+        together with the absorption.
         """
         return np.array(np.real(self.frames[0].opd))
 
@@ -692,7 +692,7 @@ class Refinement:
         ax : three Axes, optional
             Default: the axes of a new figure.
         frame : int
-            Which of `frames`; the integrations of an observation are averaged.
+            Index of the frame in `frames`; the integrations of an observation are averaged.
 
         Returns
         -------

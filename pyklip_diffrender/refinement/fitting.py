@@ -262,14 +262,14 @@ def refine(
     Parameters
     ----------
     model : OpticalSystem
-        Its detector must have the shape of the observations.
+        Model of the frames, whose detector must have the shape of the observations.
     observation : Observation or sequence of Observation
         The frames of one observation see the same star through the same wavefront and are
         averaged. Several observations (rolls, dithers, a reference star) are fitted together:
         each has its own star position, flux and background, their wavefront is shared, or differs
         by as much as `GaussNewton.drift` allows, and companions rotate with the position angle.
     opd : path, OPDMap, Quantity, array or "flat"
-        The wavefront to start from, entrance-pupil orientation; bare arrays in metres. It is
+        The wavefront to start from, entrance-pupil orientation; bare arrays in metres. The map is
         resampled to the model's pupil. "flat" stands for a flat wavefront.
     settings : GaussNewton, optional
         Default `GaussNewton.nircam()` for frames whose header says NIRCam, else `GaussNewton()`.
@@ -443,8 +443,8 @@ def jansky_per_unit(frame: FrameFit) -> float | None:
     area = _pixel_area(frame.observation)
     # The fitted flux is the light that the entrance pupil collects, in the unit of the pixels. What
     # the pipeline calibrates is the light of a source far from the occulter, all of its image
-    # through the Lyot stop. That is the fitted flux times the transmission of the stop, times the
-    # solid angle of a pixel for which the pipeline calculated its surface brightness (PIXAR_SR).
+    # through the Lyot stop. This light is the fitted flux times the transmission of the stop, times
+    # the solid angle of a pixel for which the pipeline calculated surface brightness (PIXAR_SR).
     if area is None:
         return None
     # A tensor, because the wavefront is complex where the pupil's amplitude was fitted.

@@ -212,7 +212,7 @@ pixel. The model of the companion's image may be wrong by more than the noise, a
 would explain that no better than a single pixel."""
 
 _MOST = 50
-"""Largest number of pixels of a frame that are compared, the most deviating first."""
+"""Largest number of pixels of a frame that are compared, largest deviation first."""
 
 
 def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -> list[Tensor]:
@@ -240,7 +240,7 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
             models = [linear]
             if bool((distances < _NEAR_COMPANION).any()):
                 if star_only is None:
-                    # It has its own copy of the Jacobians, as large as the fit's.
+                    # This model has its own copy of the Jacobians, as large as the fit's.
                     star_only = linear.without("companions", companions)
                 light = companions[k][max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
                 products = linear.weigh_pixels(k, pixel)
@@ -259,7 +259,7 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
 
 
 def _deviating(linear: LinearModel, k: int) -> list[tuple[int, int]]:
-    """Row and column of pixels that deviate more than those beside them, the most first."""
+    """Row and column of pixels that deviate more than their neighbours, largest deviation first."""
     cleaned = linear.cleaned[k]
     places = torch.nonzero(cleaned.abs() > _DEVIATES)
     if not len(places):

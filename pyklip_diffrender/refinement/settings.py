@@ -134,8 +134,8 @@ class GaussNewton:
         share one wavefront.
     dither_drift : WavefrontPrior, optional
         Prior on the difference between the wavefronts of the frames of one exposure sequence, such
-        as the small-grid dithers of a star. These share a difference of the size of `drift` from
-        frames before or after a slew. By default the wavefronts of any two frames differ by
+        as the small-grid dithers of a star. The sequence shares a difference of the size of `drift`
+        from frames before or after a slew. By default the wavefronts of any two frames differ by
         `drift`.
     drift_cycles : float
         Highest spatial frequency of such differences.
@@ -163,7 +163,7 @@ class GaussNewton:
         The fit has converged when a step lowers the penalised chi-squared per pixel by less.
     min_model_error : float
         Smallest error of the star model that is assumed on the way to the solution, as a fraction
-        of the star's light in a pixel. It is added in quadrature to the noise. The errors of the
+        of the star's light in a pixel, and added in quadrature to the noise. The errors of the
         result do not include it where the noise explains the residual.
     relinearise : float
         Relative error of derivatives (radians of phase, rms over the pupil) beyond which the
@@ -176,8 +176,8 @@ class GaussNewton:
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
     memory : float, str or Quantity, optional
-        Memory that the process should take, bytes or such as "2 GB", of which it needs 1.3 GB
-        for itself. Derivatives that do not fit are computed in parts whenever they are needed,
+        Memory that the process should take, bytes or such as "2 GB", including 1.3 GB for the
+        process itself. Derivatives that do not fit are computed in parts whenever they are needed,
         which takes longer and gives the same result. The Jacobians of the frames are always
         stored, so that a low limit may be exceeded. By default derivatives take up to 4 GB.
 
@@ -288,7 +288,7 @@ class GaussNewton:
     def for_map_of_age(self, days: float | None) -> GaussNewton:
         """Return settings whose prior on the segments has grown with the age of the map, days.
 
-        They are the same for a map of unknown age, and if `adapt_prior` is False.
+        The settings do not change for a map of unknown age, or if `adapt_prior` is False.
         """
         growth = math.sqrt(abs(days or 0.0) / _CURRENT_MAP_DAYS)
         if not self.adapt_prior or growth <= 1:
@@ -335,7 +335,7 @@ class GaussNewton:
         ratios : mapping of str to float
             As for `with_wider_priors`; ratios of groups of `prior` do not count.
         within : GaussNewton
-            Its drifts are the middle of the bounds, a factor of `_DRIFT_RANGE` to either side.
+            Settings whose drifts are the middle of the bounds, `_DRIFT_RANGE` times to either side.
             Dithers may differ by as much as exposures with a slew between them.
         """
         changed = {}
@@ -383,13 +383,13 @@ class GaussNewton:
         Parameters
         ----------
         filter : str, optional
-            Such as "F356W"; default as in F444W.
+            Filter, such as "F356W"; default as in F444W.
         reach : int
             Pixels by which the finest modes move light, but at most with 32 cycles: by default to
-            the edge of the square that `reduce` fits. These are 18 cycles in F444W and F210M, 22
-            in F356W and 32 in F250M.
+            the edge of the square that `reduce` fits, with 18 cycles in F444W and F210M, 22 in
+            F356W and 32 in F250M.
         image_mask : str, optional
-            Default a round one.
+            Image mask; default a round mask.
         module : "A" or "B", optional
             Default A. In B, in the short-wave channel and behind bars, the alignment of the Lyot
             stop was not measured in flight, and its prior is three times as wide.
@@ -452,7 +452,7 @@ class GaussNewton:
             max_iterations=40,
             relinearise=0.1,
             accurate_steps=True,
-            # Of 6,400 pixels, less than one unit of chi-squared. With 5e-4, fits of a star behind
+            # For 6,400 pixels, less than one unit of chi-squared. With 5e-4, fits of a star behind
             # MASK210R stop 50 to 100 units above the minimum, at a flux that is 20 % too low.
             tolerance=1e-4,
         )
@@ -550,8 +550,8 @@ def exposure_sequences(observations: Sequence[Observation]) -> list[int]:
     """Number the exposure sequence of every observation, from 0 in the order of first appearance.
 
     Frames of one star at one roll, each begun at most two hours after another one, are of one
-    sequence, such as small-grid dithers. Frames of which date or angle are not known belong to
-    every sequence of their star.
+    sequence, such as small-grid dithers. Frames whose date or angle is not known belong to every
+    sequence of their star.
     """
     numbers: list[int] = []
     for k, each in enumerate(observations):

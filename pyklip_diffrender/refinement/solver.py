@@ -1,10 +1,11 @@
 """Damped Gauss-Newton steps on the unknowns of a fit.
 
 A quick step solves the linearised problem with Gaussian priors. If it does not lower the penalised
-chi-squared, it is repeated with Levenberg-Marquardt damping. It uses derivatives of a coarse copy
-of the model at an earlier point. Where these are not sufficient, an accurate step follows: by
-conjugate gradients, with derivatives of the model itself along every direction. The schedule of a
-fit, with a model error that decreases from step to step, is in `annealing`.
+chi-squared, it is repeated with Levenberg-Marquardt damping. Quick steps use derivatives of a
+coarse copy of the model at an earlier point. Where these derivatives are not sufficient, an
+accurate step follows: by conjugate gradients, with derivatives of the model itself along every
+direction. The schedule of a fit, with a model error that decreases from step to step, is in
+`annealing`.
 """
 
 from __future__ import annotations
@@ -276,8 +277,8 @@ _ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
 
 _DIFFERENCE = 0.01
-"""Part of a step between the images whose difference is a derivative. Their curvature matters less
-than the rounding errors of single precision."""
+"""Part of a step between the images whose difference is a derivative. Over this part, curvature
+matters less than the rounding errors of single precision."""
 
 
 class ModelDerivatives:
@@ -471,8 +472,8 @@ def conjugate_gradients(
 
 
 _TRIES = 7
-"""Largest number of attempts at a step, with increasing damping. The last has a damping of 2,300:
-what has a prior hardly moves any more."""
+"""Largest number of attempts at a step, with increasing damping. The last attempt has a damping of
+2,300: what has a prior hardly moves any more."""
 
 _LEAST = 0.05
 """Smallest damping, as a multiple of the prior's precision. Less has no effect on a step."""
@@ -504,7 +505,7 @@ _FINAL = 0.01
 limits were up to 10 % too shallow near the occulter."""
 
 _FAR = 0.03
-"""Model error above which steps fail because they are large. They are damped then."""
+"""Model error above which steps fail because they are large, and are damped."""
 
 _SIMILAR = 1.5
 """Ratio of model errors above which normal equations precondition poorly."""
@@ -533,7 +534,7 @@ class StepState:
     needs_accurate: bool = False
 
     def without_damping(self) -> StepState:
-        """This state without damping, for a step to which it does not apply."""
+        """This state without damping, for a step to which the damping does not apply."""
         return replace(self, damping=0.0)
 
     def relaxed(self, ratio: float) -> StepState:
@@ -780,7 +781,7 @@ class Solver:
             equations = None if is_new else self.equations.preconditioner(state, kappa, modes)
             if equations is None:
                 equations = self.equations.about(state, kappa, modes, objective.robust, ACCURATE)
-            # Frames of reference stars, of which there may be many, hardly change the direction.
+            # Frames of reference stars, perhaps many, hardly change the direction.
             rough = {
                 k: equations.frames[k]
                 for k, forward in enumerate(objective.forwards)

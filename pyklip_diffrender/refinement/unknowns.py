@@ -129,7 +129,7 @@ class FrameUnknowns:
         return sources if self.shows_companions else sources[:0]
 
     def are_bright(self, vector: Tensor) -> Tensor:
-        """Which visible companions have light that depends noticeably on the wavefront, (k,)."""
+        """Mask of visible companions whose light depends noticeably on the wavefront, (k,)."""
         return self.visible_sources(vector)[:, 0] > _BRIGHT
 
     def bright_sources(self, vector: Tensor, kappa: float = 0.0) -> Tensor:

@@ -1,6 +1,6 @@
 """Decide which files belong to a sequence, as what, and why the others do not.
 
-The rules that look at headers are here; those that look at pixels are in `pixel_checks`.
+The rules that look at headers are here, the rules that look at pixels in `pixel_checks`.
 """
 
 from __future__ import annotations
@@ -235,7 +235,7 @@ def _same_exposures(files: Iterable[FrameFile]) -> Reasons:
 def _groups(
     files: Iterable[FrameFile], key: Callable[[FrameFile], object]
 ) -> Iterable[list[FrameFile]]:
-    """Files with one key; those whose key is None belong to no group."""
+    """Files with one key; files whose key is None belong to no group."""
     groups: dict[object, list[FrameFile]] = {}
     for each in files:
         value = key(each)
@@ -418,8 +418,8 @@ def of_other_setups(science: Sequence[FrameFile], references: Sequence[FrameFile
         lengths[each.exposure.setup] += each.exposure.integrations or 0
 
     def preference(setup: tuple[str | None, ...]) -> tuple[float, ...]:
-        # Of set-ups with as many frames of the target: the one with more cards, then with more
-        # frames of all stars, then with more integrations.
+        # Among set-ups with as many frames of the target, more cards are preferred, then more
+        # frames of all stars, then more integrations.
         known = sum(part is not None for part in setup)
         return counts[setup], known, everywhere[setup], lengths[setup]
 
@@ -570,5 +570,5 @@ def require_agreement(observations: Sequence[Observation]) -> None:
         raise IncompatibleSetupError(
             f"{', '.join(each.name for each in unknown)}: the orientation on the sky is not known "
             "(ROLL_REF and V3I_YANG of the header, position_angles), and companions rotate with "
-            "it. Add it, or refine one observation alone"
+            "it. Add the orientation, or refine one observation alone"
         )

@@ -93,7 +93,7 @@ def recorded_shifts(
     if not shifts or "IMSHIFTS" in shifts:
         return shifts.get("IMSHIFTS")
     # Since release 2.2, CENTER_SHIFT moves the star to the centre of the array, and ALIGN_SHIFT
-    # aligns the frames with each other. Both are recorded before the frames are shifted.
+    # aligns the frames with each other. Both shifts are recorded before the frames are shifted.
     if "CENTER_SHIFT" in shifts:
         middle = (np.array(shape[:0:-1]) - 1) / 2
         if (np.abs(center + shifts["CENTER_SHIFT"][0] - middle) < SAME_PLACE_PIXELS).all():
@@ -129,8 +129,8 @@ def net_shifts(
     the mask on the detector, (2,), all x, y in pixels. Without a mask, whole pixels are left out.
     """
     # A file records by how much its frames were shifted, but not by how many whole pixels they were
-    # cut or padded afterwards, all alike. These follow from the star, which was within half a pixel
-    # of the mask's centre: star = mask + shift + whole pixels + less than a half.
+    # cut or padded afterwards, all alike. The whole pixels follow from the star, which was within
+    # half a pixel of the mask's centre: star = mask + shift + whole pixels + less than a half.
     if mask is None:
         return np.asarray(shifts - np.round(shifts.mean(axis=0)))
     return np.asarray(shifts + np.round(np.median(star - mask - shifts, axis=0)))

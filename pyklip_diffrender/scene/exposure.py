@@ -146,7 +146,7 @@ class CatalogueStar:
     coordinates: tuple[float, float] | None = None  # RA and Dec, degrees
     pointing: bool = False  # the coordinates are where the telescope pointed
     motion: tuple[float, float] | None = None  # see `proper_motion`; None also if it cannot be true
-    # Julian years of which the coordinates may be: the catalogue's and the exposure's.
+    # Possible Julian years of the coordinates: the catalogue's and the exposure's.
     epochs: tuple[float, ...] = ()
 
     @property
@@ -266,8 +266,8 @@ def common_motion(headers: Iterable[tuple[fits.Header, str]]) -> tuple[float, fl
             raise IncompatibleSetupError(
                 f"the headers disagree on the star's proper motion (MU_RA, MU_DEC, arcsec per "
                 f"year): got {one[0]:g}, {one[1]:g} in {first} and {other[0]:g}, {other[1]:g} in "
-                f"{second}, expected the same to {_SAME_MOTION:g}. Correct them, or give it as "
-                "proper_motion (--proper-motion)"
+                f"{second}, expected the same to {_SAME_MOTION:g}. Correct the headers, or give "
+                "the motion as proper_motion (--proper-motion)"
             )
     if not known:
         return None
@@ -447,8 +447,8 @@ def position_angle(header: fits.Header, name: str) -> float | None:
 def beginning(header: fits.Header, name: str) -> Time | None:
     """Beginning of an exposure, UTC; None if the header does not say.
 
-    It is DATE-BEG, DATE-OBS with TIME-OBS, EXPSTART, or the day of DATE-OBS alone. CorruptFileError
-    if a card does not hold a date.
+    The date is DATE-BEG, DATE-OBS with TIME-OBS, EXPSTART, or the day of DATE-OBS alone.
+    CorruptFileError if a card does not hold a date.
     """
     dates = header_date(header, ("DATE-BEG",), name), day_and_time(header, name)
     date = next((each for each in dates if each is not None), None)

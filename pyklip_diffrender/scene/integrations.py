@@ -85,7 +85,7 @@ def mask_unusable(frames: Mapping[str, Any], valid: NDArray[np.bool_] | None = N
     """Set data to 0, errors to 1 and valid to False where pixels cannot be used, in place.
 
     The arrays of `frames`, and `valid`, which says what else is not to be used, are
-    (frames, ny, nx). They are changed frame by frame, which takes no memory.
+    (frames, ny, nx). The arrays are changed frame by frame, which takes no memory.
     """
     for k, (data, error, good) in enumerate(
         zip(frames["data"], frames["error"], frames["valid"], strict=True)

@@ -81,9 +81,9 @@ def read_calints(
 ) -> tuple[dict[str, Any], NDArray[Any] | None]:
     """Read an open calints file: arguments of `Observation.from_arrays`, and `recorded_shifts`.
 
-    The images of `hdus`, from `open_fits`, need not be read. `star` is its x, y in pixels from 0,
-    in place of what the header says. `compact` keeps pixels and errors in single precision if the
-    file has them so.
+    The images of `hdus`, from `open_fits`, need not be read. `star` is the star's x, y in pixels
+    from 0, in place of what the header says. `compact` keeps pixels and errors in single precision
+    if the file has them so.
     """
     name = Path(path).name
     if "SCI" not in hdus:
@@ -165,7 +165,7 @@ def without_empty(
 ) -> tuple[dict[str, Any], NDArray[Any] | None, Judgement | None]:
     """Leave integrations out that have no usable pixels; see `read_calints` for the arguments.
 
-    The last value says which are kept; None for all.
+    The last value says which integrations are kept; None for all.
     """
     stacks = [np.asarray(arguments[key]) for key in ("data", "error", "valid")]
     data, error, valid = (each[None] if each.ndim == 2 else each for each in stacks)

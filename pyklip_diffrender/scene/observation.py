@@ -38,7 +38,7 @@ from pyklip_diffrender.scene.jwst_files import read_calints, without_empty
 
 @dataclass(frozen=True)
 class Window:
-    """A box in frames that have their star in one place; it may reach beyond their edges."""
+    """A box in frames with the star in one place; it may reach beyond the edges of the frames."""
 
     y: int  # first row in the frame
     x: int  # first column in the frame
@@ -137,7 +137,7 @@ def means_of_file(
 ) -> dict[str, Any]:
     """Read and judge a calints file: the attributes of the means of each of its pointings.
 
-    It takes at most as much memory as the file has, however many integrations there are; see
+    Reading takes at most as much memory as the file has, however many integrations there are; see
     `Observation.means_from_fits`.
     """
     with open_fits(path, images=False) as hdus:
@@ -242,7 +242,7 @@ class Observation:
         Standard deviations, in the same unit; 1 where not valid.
     valid : ndarray of bool, (frames, ny, nx)
     unit : Unit
-        Of data and error; photons for simulations.
+        Unit of data and error; photons for simulations.
     pixelscale : tuple of float
         (x, y) arcsec per pixel.
     center : ndarray, (frames, 2)
@@ -380,7 +380,7 @@ class Observation:
         ----------
         path : path
         every_integration : bool
-            Keep a frame for every integration; those that are left out have no valid pixel.
+            Keep a frame for every integration; integrations that are left out have no valid pixel.
         star : tuple of float, optional
             x, y of the star in the file, pixels from 0, in place of what the header says.
 
@@ -408,7 +408,7 @@ class Observation:
         """Read a file as `from_fits` does, and average the integrations of each of its pointings.
 
         A fit takes such means in any case. A file of thousands of integrations is never in memory
-        as a whole: it takes at most as much memory as the file has bytes, and usually less.
+        as a whole: reading takes at most as much memory as the file has bytes, and usually less.
 
         Parameters
         ----------
@@ -431,7 +431,7 @@ class Observation:
         return cls(**means_of_file(path, star=star))
 
     def means(self) -> Observation:
-        """Average the frames of each pointing, without those that have no valid pixel.
+        """Average the frames of each pointing, without frames that have no valid pixel.
 
         See `means_from_fits`.
         """
@@ -630,9 +630,9 @@ class Observation:
             x, y = self.center[0]
             raise ShapeError(
                 f"{self.name}: {window.shape[1]} x {window.shape[0]} pixels about the star do not "
-                f"fit into {nx} x {ny}. It is at x, y = {x:.1f}, {y:.1f}, pixels from 0, with the "
-                "shifts of an alignment undone. Check its place (star), or choose a smaller "
-                "size"
+                f"fit into {nx} x {ny}. The star is at x, y = {x:.1f}, {y:.1f}, pixels from 0, "
+                "with the shifts of an alignment undone. Check its place (star), or choose a "
+                "smaller size"
             )
 
     def _cut(self, windows: list[Window]) -> Observation:

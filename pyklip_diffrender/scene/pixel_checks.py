@@ -36,8 +36,8 @@ by a few pixels. Half of a star's light passes a mask at 0.4 to 0.8 arcsec from 
 
 _PATTERN_BEHIND = 0.25
 """Largest distance, arcsec, of the centre of the star's pattern, see `center_of_pattern`, from
-where the star should be. It was at most 0.06 with sources that leave the pattern visible, and 0.33
-to 0.6 for real frames moved by 24 pixels, of which the field contains a part."""
+where the star should be. The distance was at most 0.06 with sources that leave the pattern visible,
+and 0.33 to 0.6 for real frames moved by 24 pixels, of which the field contains a part."""
 
 _OUTSIDE = 0.35
 """Distance, arcsec, from the star beyond which another source is looked for."""

@@ -127,7 +127,7 @@ class Sequence:
     target : str
         Name of the target.
     science : tuple of Observation
-        One for each roll or pointing of the target, in order of time.
+        Frames of the target, one observation for each roll or pointing, in order of time.
     references : tuple of Observation
         Frames of other stars through the same coronagraph, in order of time, of `same_epoch` and
         `other_epochs`.
@@ -201,9 +201,8 @@ class Sequence:
             both, science is the target and psf are references, whatever the headers say. In a
             folder, association files are not read.
         target : str, optional
-            Name of the target (TARGPROP or TARGNAME), in which case, spaces and dashes do not
-            matter. Default the star that is not marked as a reference (IS_PSF), if there is just
-            one.
+            Name of the target (TARGPROP or TARGNAME); case, spaces and dashes do not matter.
+            Default the star that is not marked as a reference (IS_PSF), if there is just one.
         filter : str, optional
             Filter to use. Default the one of all files, if there is just one.
         epoch : str or Time, optional

@@ -46,9 +46,9 @@ enough in all filters of both channels; two cells per pixel take four times as l
 def model_for(observation: Observation, size: int | None = None, **overrides: Any) -> OpticalSystem:
     """Make the model of the coronagraph for an observation.
 
-    Frames whose header says NIRCam get the detector's scale and shear from the SIAF and the Lyot
-    stop where it is in flight, or where it should be if that was not measured (short wave, bars
-    and module B). This is where a fit starts. A model that was made before is used again.
+    Frames whose header says NIRCam get the detector's scale and shear from the SIAF, and the Lyot
+    stop in its place in flight, or in its nominal place if that was not measured (short wave, bars
+    and module B). A fit starts from this model. A model that was made before is used again.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
 def _place_of(
     observation: Observation, mask: str | None = None, module: str | None = None
 ) -> DetectorPlace:
-    """Where the star of a frame of NIRCam is, behind the mask of its header or another one.
+    """Place of the star in a frame of NIRCam, behind the mask in its header or another mask.
 
     IncompatibleSetupError if the header does not say, or what it says is not modelled.
     """
@@ -201,7 +201,7 @@ def images_of_stars(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Images, (n, n), of a star behind the mask and of one `away` from it (arcsec, in y).
 
-    They are monochromatic, with an arbitrary wavefront, and show `reach` (arcsec) about both.
+    The images are monochromatic, with an arbitrary wavefront, and show `reach` (arcsec) about both.
     """
     size = 2 * int(np.ceil((away + reach) / np.mean(observation.pixelscale))) + 1
     npix = pupil_samples(observation, (size, size), 128)

@@ -1,4 +1,4 @@
-"""Where the star is in an image of it behind a mask, to half a pixel."""
+"""Place of a star in an image behind a mask, to half a pixel."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ def without_gaps(image: Image) -> Image:
 def center_of_symmetry(image: Image) -> Image:
     """x, y from the middle, (2,), in pixels, of the point about which an image is most symmetric.
 
-    The image is (n, n) with n odd; negative pixels count as 0. It is good to a tenth of a pixel for
-    stars on real frames.
+    The image is (n, n) with n odd; negative pixels count as 0. The point is good to a tenth of a
+    pixel for stars on real frames.
     """
     # The convolution of the image with itself at 2 c, sum over x of f(x) f(2 c - x), compares it
     # with itself turned by 180 degrees about c; it is largest where these are most alike.
@@ -101,7 +101,7 @@ def center_of_symmetry(image: Image) -> Image:
 
 
 def _vertex(values: Image, peak: int) -> float:
-    """Where the parabola through a maximum and its neighbours is largest, from the maximum."""
+    """Vertex of the parabola through a maximum and its neighbours, relative to the maximum."""
     low, middle, high = values[[peak - 1, peak, (peak + 1) % len(values)]]
     curvature = low - 2 * middle + high
     return float(0.5 * (low - high) / curvature) if curvature < 0 else 0.0

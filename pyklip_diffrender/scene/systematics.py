@@ -210,10 +210,10 @@ class Systematics:
         Standard deviation of the pattern where it has not been measured.
     pedestal : float
         Constant, in the unit of the frames, that is added to the star before the pattern
-        multiplies it. A fit starts from it, and has a free pedestal in every frame. It stands for
-        what fixed patterns leave far from the star: the pattern of the flat field in the thermal
-        background, which was subtracted as if the flat field were perfect, and the pattern of the
-        dark current.
+        multiplies it. A fit starts from it, and has a free pedestal in every frame. The pedestal
+        stands for what fixed patterns leave far from the star: the pattern of the flat field in the
+        thermal background, which was subtracted as if the flat field were perfect, and the pattern
+        of the dark current.
     first_pixel : tuple of int or None
         Column and row of the pattern's first pixel on the full detector, as of an `Observation`.
     filter, image_mask, detector : str or None

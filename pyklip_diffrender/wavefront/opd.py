@@ -60,9 +60,9 @@ def read_opd(
     """Read an OPD map from a FITS file.
 
     Maps of the mission's wavefront sensing from MAST are recognised by their extension
-    RESULT_PHASE. They are in microns without a unit in the header, and contain the aberrations of
-    the sensing camera. These are subtracted with stpsf's models if stpsf and its data are
-    installed; otherwise they are kept, with a warning. See ``wss.load_wss_opd``.
+    RESULT_PHASE. These maps are in microns without a unit in the header, and contain the
+    aberrations of the sensing camera. The aberrations are subtracted with stpsf's models if stpsf
+    and its data are installed, and otherwise kept, with a warning. See ``wss.load_wss_opd``.
 
     Parameters
     ----------
@@ -169,8 +169,8 @@ def _image(hdus: fits.HDUList, extension: str | int | None, path: Path) -> Any:
             what = f"{product}, a product of pyklip_diffrender"
         raise CorruptFileError(
             f"{path.name}: this is no wavefront map, but {what}. Expected a map of the wavefront "
-            "sensing (R2022081102-NRCA3_FP1-1.fits, for example) or another OPD map; frames are "
-            "given in place of the frames"
+            "sensing (R2022081102-NRCA3_FP1-1.fits, for example) or another OPD map. Give "
+            "exposures as frames instead"
         )
     images = [each for each in hdus if each.data is not None and np.ndim(each.data) == 2]
     if not images:
@@ -225,7 +225,7 @@ def _checked(raw: OPDMap) -> OPDMap:
 
 
 def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
-    """Draw a wavefront like those measured in flight.
+    """Draw a wavefront like the wavefronts measured in flight.
 
     Segment piston, tip and tilt carry 24 % of the variance (as in the maps of 2022-08-11 and
     2022-08-14). The rest is texture inside the segments, whose amplitude is constant up to 8

@@ -115,7 +115,7 @@ class WavefrontPrior:
         Parameters
         ----------
         ratios : mapping of str to float
-            By group of modes, and "amplitude" for the scale of the amplitude modes.
+            Ratios by group of modes, and "amplitude" for the scale of the amplitude modes.
 
         Examples
         --------
@@ -144,7 +144,7 @@ class EvidenceUpdate:
     log_evidence: float  # up to a constant that does not depend on the scales
 
     def in_units(self, unit: Tensor) -> EvidenceUpdate:
-        """Return the prior in other units, of which `unit` make up one old unit, (parameters,)."""
+        """Return the solution in other units; `unit`, (parameters,), is an old unit in new ones."""
         variance = None if self.variance is None else self.variance * unit**2
         return replace(self, step=self.step * unit, variance=variance)
 
@@ -161,7 +161,7 @@ def learn_prior(
     Parameters
     ----------
     maps : sequence of ndarray, (n, n)
-        At least two, m, entrance-pupil orientation; 0 or constant outside the mirror.
+        At least two maps, m, entrance-pupil orientation; 0 or constant outside the mirror.
     basis : Basis
     diameter : float or Quantity
         Side of the maps, m.
@@ -232,7 +232,7 @@ def learn_prior(
 def _invert_lower(factor: Tensor) -> Tensor:
     """Inverse of a lower triangle, in half the time of solving for the identity.
 
-    It replaces `factor` in memory where columns are contiguous, as in torch's Cholesky factors.
+    The inverse overwrites `factor` if its columns are contiguous, as in torch's Cholesky factors.
     """
     inverse, failure = dtrtri(factor.numpy(), lower=1, overwrite_c=1)
     assert not failure, "a Cholesky factor has no zero on its diagonal"
