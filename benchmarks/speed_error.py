@@ -418,7 +418,8 @@ def draw(table: Table, what: str) -> Figure:
         ax.loglog(line["seconds"], line["error"], marker, ms=6, label=label)
         for each in {0, len(line) - 1} if len(line) > 1 else ():
             ax.annotate(
-                str(line["setting"][each]), (line["seconds"][each], line["error"][each]),
+                str(line["setting"][each]).replace("dithered ", ""),
+                (line["seconds"][each], line["error"][each]),
                 xytext=(6, 5), textcoords="offset points", fontsize=7,
             )  # fmt: skip
     ax.margins(0.15)
