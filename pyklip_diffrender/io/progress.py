@@ -113,7 +113,7 @@ class ProgressBar:
             desc=self._name,
             disable=self._nested or not shown,
             leave=False,
-            # The time left follows from the mean of all steps; from the last few steps, it jumps.
+            # The time left by the mean of all steps; by the last few steps, it would jump.
             smoothing=0,
             bar_format=_OPEN if total is None else _COUNTED,
         )
