@@ -263,8 +263,8 @@ def candidates_table(
 ) -> QTable:
     """Make the table of candidates; see `Combination.candidates`.
 
-    `filters` are those of their fluxes, and `stars` has the flux of the star by filter, in their
-    unit: Jy, or contrast if `jansky` is False. `dated` says whether the epoch is known.
+    `filters` are the filters with fluxes, and `stars` has the flux of the star by filter, in the
+    same unit: Jy, or contrast if `jansky` is False. `dated` says whether the epoch is known.
     """
     count = len(sources)
     places = np.array([each.place for each in sources]).reshape(-1, 2)
@@ -310,14 +310,14 @@ def candidates_table(
         columns += [
             (f"contrast_{name}", snr * error / stars[name], None, ".3e", f"in {name}"),
             (f"contrast_error_{name}", error / stars[name], None, ".1e",
-             "without those of the star's flux and of the source's image"),
+             "without errors of the star's flux and of the source's image"),
             (f"snr_{name}", snr, None, ".1f", f"in {name} alone"),
         ]  # fmt: skip
         if jansky:
             columns += [
                 (f"flux_density_{name}", snr * error, u.Jy, ".3e", f"in {name}"),
                 (f"flux_density_error_{name}", error, u.Jy, ".1e",
-                 "without that of the calibration"),
+                 "without the calibration's error"),
             ]  # fmt: skip
     known = [each.hypotheses for each in sources if each.hypotheses is not None]
     if len(known) == count > 0:

@@ -4,7 +4,7 @@ Frames of reference stars make limits of a target deeper near the star, where th
 them, and may make them shallower elsewhere, where their pattern is not quite the target's. Both
 fits are valid measurements. At every separation the one with the deeper stated limit is used. The
 choice rests on errors, not on the S/N, so that every pixel is searched once and thresholds and
-false-alarm probabilities are those of a single search.
+false-alarm probabilities of a single search apply.
 """
 
 from __future__ import annotations

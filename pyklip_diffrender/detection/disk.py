@@ -54,7 +54,7 @@ from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
-# Which light of sources on a grid is extended, and which is that of point sources.
+# Which light of sources on a grid is extended, and which belongs to point sources.
 #
 # The brightness of the sources is smoothed by a beam of lambda/D. Of all straight lines of a given
 # length through a position, in all directions, one is brightest at its faintest point: that
@@ -246,7 +246,7 @@ class Disk:
         Parameters
         ----------
         ax : two Axes, optional
-            Default those of a new figure.
+            Axes to draw in; a new figure by default.
 
         Returns
         -------

@@ -179,8 +179,8 @@ class Sky:
         Mean of the target's mid-exposures, UTC; None if no frame has a date.
     star : (float, float) or None
         Flux density of the star, as a catalogue states it or else as fitted, and its standard
-        deviation, Jy; None where the frames have no photometric calibration. The error is that of
-        the diffracted light or of the catalogue, without that of the calibration.
+        deviation, Jy; None where the frames have no photometric calibration. The error
+        includes the fit or the catalogue, but not the photometric calibration.
     vega : float or None
         Flux density of Vega magnitude 0 in the filter, Jy; None if it is not known.
     """

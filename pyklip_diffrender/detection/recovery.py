@@ -62,7 +62,7 @@ class MeasuredPlanet(NamedTuple):
 
     # Of the candidate within 0.1 arcsec, or else measured at the place of the planet.
     contrast: float
-    contrast_error: float  # Without that of the star's flux.
+    contrast_error: float  # Without the error of the star's flux.
     snr: float
     detected: bool  # Whether there is such a candidate.
 
@@ -158,8 +158,8 @@ def measured_planet(
 ) -> MeasuredPlanet:
     """Measure a planet at a known place, x, y from the star in the first frame, arcsec.
 
-    `flux` is that of the star to which the contrast is relative, in the unit of `FrameFit.flux`: of
-    an injected planet, that of the fit with which it was rendered.
+    `flux` is the flux of the star to which the contrast is relative, in the unit of
+    `FrameFit.flux`; for an injected planet, the flux in the fit with which it was rendered.
     """
     sources, factor = detection.sources, detection.error_factor
     unit = detection.fits[0].frames[0].flux / flux
@@ -200,7 +200,7 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
 # are found. Here planets of several contrasts are added to the frames, to first order: the maps of
 # a search are linear in the data, so that the light of a planet changes them by its contrast times
 # a map that is computed once for each place. Every map is then searched as if nothing were known of
-# the planet. The true-positive fraction is that of Jensen-Clem et al., AJ 155, 19 (2018), for the
+# the planet. The true-positive fraction is as in Jensen-Clem et al., AJ 155, 19 (2018), for the
 # false-positive fraction of the threshold.
 
 _STRENGTHS = tuple(np.geomspace(0.4, 3.0, 12).tolist())

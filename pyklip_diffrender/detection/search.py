@@ -206,7 +206,7 @@ def detect(
         Separations of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     without_limits : ndarray of bool, (ny, nx), optional
         Pixels of the first frame that the contrast curve leaves out: see ``hides_points`` of
-        `Disk`. Separations of which no pixel is left have no row.
+        `Disk`. Separations without a pixel left have no row.
     relinearise : float
         S/N of a candidate above which the star is refined again with the candidates in the model,
         because bright sources bias the wavefront about which the model is linearised. Where a fit
@@ -355,7 +355,7 @@ def _false_alarms(outcome: _Outcome) -> NDArray[np.float64]:
 def _require_shape(actual: tuple[int, ...], expected: tuple[int, ...]) -> None:
     if actual != expected:
         raise IncompatibleSetupError(
-            f"without_limits: got the shape {actual}; expected that of the first frame, {expected}"
+            f"without_limits: got the shape {actual}; expected the first frame's, {expected}"
         )
 
 

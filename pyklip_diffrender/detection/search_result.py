@@ -115,7 +115,7 @@ class Detection:
     groups : tuple of (LinearModel, Templates)
         Linear model and templates of each fit of the target; empty without `fits`.
     contrast : ndarray, (ny, nx)
-        Flux of a point source at every pixel over that of the star, before the coronagraph.
+        Flux of a point source at every pixel over the star's, before the coronagraph.
     error : ndarray, (ny, nx)
         Standard deviation of `contrast`, with the factor `error_factor`.
     photon_error : ndarray, (ny, nx)
@@ -147,10 +147,10 @@ class Detection:
     path : Path or None
         File that the detection was read from.
     other : Detection or None
-        Search of another fit of the same frames, such as that of the target without reference
-        stars, where it is the deeper one at some separations.
+        Search with another fit of the same frames, such as the target without reference
+        stars, where that search is deeper at some separations.
     of_other : ndarray of bool, (ny, nx), or None
-        Pixels whose maps, candidates and limits are those of `other`, relative to the star of
+        Pixels whose maps, candidates and limits come from `other`, relative to the star of
         `fits`.
 
     Examples
@@ -258,11 +258,11 @@ class Detection:
         orientation there are the offsets in right ascension and declination and their correlation,
         with a date the epoch, and for calibrated frames the flux density and the AB magnitude.
 
-        Errors are standard deviations, with all parameters of the star marginalised. Those of
+        Errors are standard deviations, with all parameters of the star marginalised. Errors of
         positions include the error of the star's position behind the mask, and do not include
-        errors of the pixel scale and of the roll angle. The error of the contrast includes those of
+        errors of the pixel scale and of the roll angle. The contrast's error includes errors of
         the star's flux (10 % for real frames, unless ``reduce(star_flux=...)`` says it), of the
-        source's own image and of its position; that of the flux density does not depend on the
+        source's own image and of its position; the flux density's error does not depend on the
         star's flux. The S/N is the contrast over its error for a known position and image, because
         the others do not change the significance of a source.
         """
@@ -345,8 +345,8 @@ class Detection:
         Parameters
         ----------
         image : "contrast", "snr" or "subtracted"
-            The map of contrasts or of S/N, or a frame without its star, see `subtracted`. That of
-            S/N has no uncertainty.
+            The map of contrasts or of S/N, or a frame without its star, see `subtracted`. The map
+            of S/N has no uncertainty.
         frame : int
             Which of the frames, for "subtracted".
 
@@ -518,12 +518,12 @@ class Detection:
         """Draw the S/N map with the candidates, and the contrast curve.
 
         The map has north up and east left, in arcsec from the star, where the position angle of the
-        first frame is known; else it is that of the first frame, in x and y.
+        first frame is known; else it has x and y of the first frame.
 
         Parameters
         ----------
         ax : two Axes, optional
-            Default those of a new figure.
+            Axes to draw in; a new figure by default.
 
         Returns
         -------

@@ -264,7 +264,7 @@ class KlipSubtraction:
         star = torch.zeros(1, 2, dtype=torch.float64)
         places = np.array([templates.pixels_of(k, star)[::-1, 0] for k in frames])
         recorded = np.array([each.observation.center.mean(axis=0) for each in frames.values()])
-        # The fit knows by how much the recorded positions are off; those of the references, which
+        # The fit knows by how much the recorded positions are off; the references, whose positions
         # were recorded in the same way, are taken to be off by as much.
         others = [
             each.center.mean(axis=0) + (places - recorded).mean(axis=0) for each in references
@@ -310,7 +310,7 @@ class KlipSubtraction:
         side = 2 * _HALF + 1
         kernel = np.pad(image, _HALF)[row : row + side, column : column + side]
         self.norm = float(np.sqrt((kernel**2).sum()))
-        """Of a planet of contrast 1 in a smoothed image of which nothing was subtracted."""
+        """Peak of a planet of contrast 1 in a smoothed image before any subtraction."""
         self._kernel = kernel[::-1, ::-1] / self.norm
 
     @property

@@ -230,7 +230,7 @@ class _Reader:
     def sequence(
         self, content: Any, place: str, options: Options, planets: Injections
     ) -> SequenceConfig | None:
-        """A sequence, whose own options and planets come before those of all; None without one."""
+        """A sequence, whose own options and planets override the survey's; None without one."""
         given = self.values(content, place, {
             "files": (
                 "FITS files, folders of them, patterns such as frames/*_calints.fits or "
@@ -280,7 +280,7 @@ class _Reader:
         """Options of a table, whose values they are taken from."""
         own = {each.name: given.pop(each.name) for each in fields(Options) if each.name in given}
         if "settings" in own:
-            # Those of a sequence come on top of the survey's.
+            # Settings of a sequence come on top of the survey's.
             settings = {**default.settings, **own.pop("settings")}
             wrong = _wrong_settings(settings)
             self.problems += [f"{place}: settings: {each}" for each in wrong]
@@ -404,7 +404,7 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
     except DiffrenderError as error:
         return [str(error)]
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        return [f"got a value of the wrong type ({error}), expected those of GaussNewton"]
+        return [f"got a value of the wrong type ({error}), expected the types of GaussNewton"]
     return []
 
 

@@ -218,7 +218,7 @@ def hash_of(facts: Mapping[str, Any]) -> str:
 
 
 def _files(paths: tuple[Path, ...]) -> list[Path]:
-    """The files themselves, and those of folders."""
+    """Paths of the files, and of the files in folders."""
     files: list[Path] = []
     for path in paths:
         inside = fits_files(path) if path.is_dir() else [path]
