@@ -334,7 +334,7 @@ class SkyModel:
             sums: dict[int, list[Tensor]] = {k: [] for k in templates.frames}
             for each, chosen in enumerate(members):
                 images = templates.at_pixels(rows[chosen], columns[chosen])
-                # Those behind the mask would otherwise be lost among the others.
+                # Sources behind the mask would otherwise be lost among the others.
                 peak = peaks.setdefault(each, images[min(images)].double().amax(dim=(1, 2)))
                 weight = torch.from_numpy(signs[chosen]) / peak
                 for k, image in images.items():

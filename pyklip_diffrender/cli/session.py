@@ -123,7 +123,7 @@ class Run:
 
     # Whether to show progress bars.
     progress: bool = False
-    # Of PyTorch.
+    # Device of PyTorch.
     device: str = ReduceOptions.device
     _output: Path | None = None
     _before: dict[Path, int] = field(default_factory=dict)

@@ -80,7 +80,7 @@ _FLUX_RANGE = math.log(1e3)
 """Logarithm of the ratio of the largest flux of sources to the smallest; log F is uniform."""
 
 _NEGLIGIBLE = 1e-4
-"""Likelihood of two sightings as one source, over that as two, below which they are two."""
+"""Likelihood of two sightings as one source over two sources, below which they are two."""
 
 _MOST_ASSOCIATIONS = 2000
 """Associations that are kept while sightings are added, the most probable ones."""

@@ -44,7 +44,7 @@ class Candidates:
     # known.
     covariance: Tensor
     # (k,), standard deviations of the contrasts for known positions, as in a map of S/N; 0 where
-    # not known. Those in `covariance` include what the uncertain positions add.
+    # not known. Errors in `covariance` include what the uncertain positions add.
     detection_errors: Tensor
     converged: bool = True
 
@@ -383,7 +383,7 @@ def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
 def unconfirmed_companions(
     fits: Sequence[Refinement], candidates: Candidates
 ) -> NDArray[np.float64]:
-    """Companions of the fits of the target that are none of the candidates, (k, 3).
+    """Companions of the target's fits that are not among the candidates, (k, 3).
 
     Contrast, and x and y from the star in the first frame of their fit, arcsec; candidates'
     positions refer to the first frame of the first fit.

@@ -58,7 +58,7 @@ class CombinedSource:
     false_alarm: float
     spectrum: str
     snr: float  # With that spectrum.
-    chi2: float  # Of the fluxes about the best listed spectrum; NaN without one.
+    chi2: float  # Chi-squared of the fluxes about the best listed spectrum; NaN without one.
     fluxes: SkyStack  # At the place, (filters,).
     hypotheses: Hypotheses | None
     # Date (MJD), place (2,) and covariance (2, 2) at each epoch where it was seen.
@@ -73,7 +73,7 @@ class Combination:
     ----------
     target : str
     maps : tuple of SkyMap
-        Of the reductions that were searched together.
+        Maps of the reductions that were searched together.
     left_out : tuple of (str, str)
         Reductions, and spectra of a file, that were not used, and why.
     spectra : PlanetSpectra
@@ -82,7 +82,7 @@ class Combination:
     free : bool
         Whether any spectrum without negative fluxes was searched as well.
     unit : "Jy" or "contrast"
-        Of the fluxes to which the spectra refer.
+        Unit of the fluxes to which the spectra refer.
     threshold : float
         S/N of a candidate of a single search.
     thresholds : dict of str to float
@@ -102,7 +102,7 @@ class Combination:
     grid : ndarray, (ny, nx, 2)
         East and north of the star of the pixels of `snr`, arcsec.
     snr : ndarray, (spectra, ny, nx)
-        Of a source with each spectrum that does not move; NaN where nothing is known.
+        S/N of a source with each spectrum that does not move; NaN where nothing is known.
     motion : Motion or None
         If there are several epochs.
     remarks : tuple of str

@@ -23,7 +23,7 @@ from pyklip_diffrender.detection.field import Image, is_within, separation_of
 from pyklip_diffrender.detection.search_result import Detection
 
 _SAME_SOURCE_LAMBDA_D = 0.5
-"""Distance of candidates of the two searches that are one source. The searches share the target's
+"""Largest distance of two searches' candidates that are one source. The searches share the target's
 frames, so that their positions of a source differ by less than the error of either, a tenth of
 lambda/D at S/N 5."""
 

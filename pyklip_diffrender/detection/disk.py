@@ -342,7 +342,7 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
     Parameters
     ----------
     fit : Refinement
-        Of the target. The result's own has no companions: they are in its data.
+        Fit of the target. The result's own fit has no companions: they are in its data.
     inner : float or Quantity
         Smallest separation of sources, arcsec.
     progress : bool

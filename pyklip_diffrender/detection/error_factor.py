@@ -187,7 +187,7 @@ class ErrorFactor:
 
     @property
     def is_measured(self) -> bool:
-        """Whether it follows the scatter of the S/N, and not chi-squared alone."""
+        """Whether the factor follows the scatter of the S/N, and not chi-squared alone."""
         return bool(np.isfinite(self.freedom).any())
 
     @property
@@ -395,7 +395,7 @@ class Significance:
         """Pixel of the highest peak that is significant, judged by the scatter without it.
 
         `snr` (ny, nx) is before errors are multiplied, with the known sources at x, y, (k, 2),
-        removed. `threshold` is that in Gaussian noise; where the scatter is measured, the S/N
+        removed. `threshold` is for Gaussian noise; where the scatter is measured, the S/N
         that Student's t exceeds as rarely takes its place.
         """
         peaks = self.significant_peaks(snr, sources, threshold, allowed)

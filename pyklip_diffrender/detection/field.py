@@ -192,7 +192,7 @@ class Sky:
 
     @classmethod
     def of(cls, fits: Sequence[Refinement], scatter: float = 1.0) -> Sky:
-        """Of the frames of the target, with errors multiplied by `scatter`."""
+        """Relation of the target's frames to the sky, with errors multiplied by `scatter`."""
         first = fits[0].frames[0].observation
         frames = [f for fit in fits for f in fit.frames if not f.observation.reference]
         # Where the middle of an exposure is not known, its beginning is near enough for an orbit.

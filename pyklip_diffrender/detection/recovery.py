@@ -60,7 +60,7 @@ _STEP = 10.0
 class MeasuredPlanet(NamedTuple):
     """Measurement of a planet."""
 
-    # Of the candidate within 0.1 arcsec, or else measured at the place of the planet.
+    # Values of the candidate within 0.1 arcsec, or else measured at the place of the planet.
     contrast: float
     contrast_error: float  # Without the error of the star's flux.
     snr: float
@@ -178,7 +178,7 @@ def measured_planet(
 def _free_place(detection: Detection, separation: float, angle: float) -> NDArray[np.float64]:
     """x, y at a separation, where there are limits and no candidate is near.
 
-    The first such place counter-clockwise from the angle; if there is none, that at the angle.
+    The first such place counter-clockwise from the angle; if there is none, the place at the angle.
     """
     table = detection.candidates
     candidates = np.stack([table["x"].value, table["y"].value], axis=-1)
@@ -208,7 +208,7 @@ _STRENGTHS = tuple(np.geomspace(0.4, 3.0, 12).tolist())
 
 
 _NEAR = 0.5
-"""Distance in lambda/D of a candidate from the planet that it is."""
+"""Largest distance of a candidate from the planet that it stands for, lambda/D."""
 
 _BATCH = 64
 """Number of planets whose maps are computed at a time."""

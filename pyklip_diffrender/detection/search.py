@@ -60,7 +60,7 @@ def side_lobes(
     """Which candidates are not significant beside a source within the inner limit, (k,).
 
     `snr` (ny, nx) is without the candidates, before errors are multiplied by the factor;
-    `threshold` is that in Gaussian noise, and `inner` the smallest separation of candidates,
+    `threshold` is for Gaussian noise, and `inner` the smallest separation of candidates,
     arcsec.
     """
     none = torch.zeros(len(candidates), dtype=torch.bool)
@@ -99,7 +99,7 @@ _LOWEST = 5.0
 """S/N of a peak that is tried, without a factor."""
 
 _BETTER = 0.9
-"""Largest ratio of chi-squared with a companion to that without it. A planet that ends a fit at a
+"""Largest ratio of chi-squared with to without a companion. A planet that ends a fit at a
 wrong wavefront dominates chi-squared; errors of the model do not go away with one companion."""
 
 _UNEXPLAINED = (Status.MODEL_MISMATCH, Status.ITERATION_LIMIT)

@@ -137,7 +137,7 @@ class Detection:
         Chi-squared per pixel, without the candidates, and error factor between separations.
     threshold : float
         Smallest S/N of a candidate in Gaussian noise. Where errors were scaled to the scatter of
-        the S/N, ``error_factor.threshold(threshold, offsets)`` is that at a position.
+        the S/N, ``error_factor.threshold(threshold, offsets)`` is the value at a position.
     contrast_curve : QTable
         See `contrast_curve`.
     has_limits : ndarray of bool, (ny, nx)
@@ -285,7 +285,7 @@ class Detection:
             unit), and one that is named like the filter, such as F444W or JWST_NIRCam.F444W, with
             absolute Vega magnitudes, AB magnitudes (unit mag(AB)), or flux densities at 10 pc.
         parallax : float, Quantity or str, optional
-            Of the star, arcsec or such as "9.3 mas"; needed with `isochrone`.
+            Parallax of the star, arcsec or such as "9.3 mas"; needed with `isochrone`.
 
         Returns
         -------

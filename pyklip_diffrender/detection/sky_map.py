@@ -31,8 +31,8 @@ from pyklip_diffrender.io.units import east_and_north
 from pyklip_diffrender.scene.admission import EPOCH
 
 _ORDER = 5
-"""Of the splines between pixels. S/N maps have no higher frequencies than images, whose pixels are
-just small enough for them."""
+"""Order of the splines between pixels. S/N maps have no higher frequencies than images, whose
+pixels are just small enough for them."""
 
 LIGHT = 1.5
 """lambda/D from a source at which its light ends, and within which two peaks are one source."""
@@ -50,7 +50,7 @@ class MapSource:
     covariance: Image  # (2, 2), of the place, arcsec^2, with `POSITION`.
     snr: float
     sigmas: float  # The S/N in Gaussian standard deviations.
-    error: float  # Of the contrast, for a known image and a known flux of the star.
+    error: float  # Error of the contrast, for a known image and a known flux of the star.
     flux: tuple[float, float]  # Contrast and its error, with all that is not known.
 
 
@@ -202,7 +202,7 @@ class SkyMap:
     @cached_property
     def curvature(self) -> NDArray[np.float64]:
         """Covariance of the gradient of noise of standard deviation 1, (2, 2), per arcsec^2."""
-        # That is the curvature of the autocorrelation, to the east and to the north. Slopes are
+        # It is the curvature of the autocorrelation, to the east and to the north. Slopes are
         #
         #     f' = (f(-2 h) - 8 f(-h) + 8 f(h) - f(2 h)) / 12 h,
         #

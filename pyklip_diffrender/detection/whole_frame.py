@@ -73,7 +73,7 @@ _FITTED = 9
 class WholeFrame:
     """A whole frame with the fitted star and the background removed."""
 
-    fit: FrameFit  # Of the star in the pixels about it.
+    fit: FrameFit  # Fit of the star in the pixels about it.
     observation: Observation  # The whole frame, of which the fit has a part.
     roll: float  # Rotation of the sky from the first frame to this one, degrees.
     # (k, 3), contrast, and x, y from the star in the first frame, of the sources that were found in
@@ -128,7 +128,7 @@ class WholeFrame:
         combined = self.observation.combined()
         image = np.asarray(combined.data[0] - self.stars)
         separation = separation_of(self.grid)
-        # Of a small frame, its outer part.
+        # In a small frame, its outer part is used.
         core = min(_CORE, 0.7 * float(separation[combined.valid[0]].max()))
         unused = ~combined.valid[0] | (separation < core)
         ground = Background2D(

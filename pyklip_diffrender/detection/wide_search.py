@@ -690,7 +690,7 @@ def _add_shapes(
 ) -> None:
     """Add chi-squared of the point source and the shape to a table of sources.
 
-    Those in the fitted pixels, None, are not judged.
+    Sources in the fitted pixels, None, are not judged.
     """
     shapes = [None if each is None else each.shape for each in sources]
     kinds = ["" if s is None else "extended" if s.shape else "point" for s in sources]

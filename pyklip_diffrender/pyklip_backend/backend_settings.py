@@ -55,7 +55,7 @@ class DiffrenderSettings:
         folder of maps, the one closest in time to the frames is taken; see `choose_map` for other
         rules. "flat" stands for a flat wavefront.
     model : optical model or mapping, optional
-        From `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
+        Model from `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
         from the wavelength in ``dataset.wvs`` to a model. Made for the filter if not given.
     filter : str, optional
         NIRCam filter, such as ``"F444W"``. Read from the dataset if possible.

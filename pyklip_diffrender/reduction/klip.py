@@ -54,7 +54,7 @@ _TRIALS = 4
 """Position angles at which planets are injected at every separation."""
 
 _GOLDEN = 137.5
-"""Degrees from the planets at one separation to those at the next."""
+"""Degrees from the planets at one separation to the planets at the next."""
 
 _TURN = 1.0
 """Degrees between rolls that are references of each other."""
@@ -154,7 +154,7 @@ def klip_curve(
     )
     # limit = 5 noise / response, with the noise in a ring of width lambda/D, where the detection
     # has limits, and the response to an injected planet of contrast 1. At every separation the
-    # number of modes is that with the best limit.
+    # number of modes is the one with the best limit.
     # So faint that the modes hardly change.
     contrasts = _SIGMAS * noise.min(axis=0) / klip.norm
     response, alone = np.zeros_like(noise), np.zeros(len(separations))

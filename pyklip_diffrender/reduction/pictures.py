@@ -470,7 +470,7 @@ def _measured(
 ) -> tuple[tuple[str, str], NDArray[np.float64], NDArray[np.float64]]:
     """Contrast and offset (3,) of a candidate, arcsec, with their names and covariance (3, 3).
 
-    The offset is that to the east and north where the orientation is known, else x and y.
+    The offset is to the east and north where the orientation is known, else x and y.
     """
     row = detection.candidates[place]
     is_known = "delta_ra" in row.colnames

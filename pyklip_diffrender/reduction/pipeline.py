@@ -214,7 +214,7 @@ def prepare(
         _log.warning("%s", remark)
 
     def map_for(date: Time | None) -> OPDMap:
-        """Of a folder of maps, the one nearest to a date."""
+        """Map nearest to a date, if there is a folder of maps."""
         return wavefront_for(opd, date) if is_folder and date is not None else wavefront
 
     if options.star_flux is not None:
@@ -303,7 +303,7 @@ class Preparation:
     options: ReduceOptions
     # Fit settings; None: the defaults of `refine`.
     settings: GaussNewton | None = None
-    # The wavefront to start from at another date; None for the same at all.
+    # The wavefront to start from at another date; None for the same at all dates.
     map_for: Callable[[Time | None], OPDMap] | None = None
 
     def run(self, *, progress: bool = False, products: Keeper | None = None) -> ReductionResult:

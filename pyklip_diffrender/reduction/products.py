@@ -38,7 +38,7 @@ _PHOTOMETRY = (
     "transmission of mask and Lyot stop is accounted for. Their errors do not include the "
     "pipeline's photometric calibration behind the coronagraph, about 30 % (0.3 mag)."
 )
-"""Whatever stands beside a flux density."""
+"""Note beside every flux density."""
 
 
 def page(

@@ -134,7 +134,7 @@ class Contribution:
     reason: str = ""
     # Per pixel in the joint fit; like the following NaN without one.
     chi2: float = math.nan
-    # Of its star, over the target's.
+    # Flux of its star over the target's.
     flux: float = math.nan
     # Rms of its wavefront minus the wavefront of the target's first frame, nm.
     drift: float = math.nan
@@ -147,8 +147,8 @@ class Visit:
     # One for each frame of a reference star.
     contributions: tuple[Contribution, ...] = ()
     # Limits of the target's frames alone over the limits of all frames, in units of flux: the
-    # median over the separations from 0.4 to 2 arcsec at which the latter is used. NaN if it is
-    # used nowhere.
+    # median over the separations from 0.4 to 2 arcsec at which all frames are used. NaN if they
+    # are used nowhere.
     gain: float = math.nan
     # These separations in words, such as "at 0.2 to 0.5 arcsec"; empty for all.
     where: str = ""
@@ -158,7 +158,7 @@ class Visit:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any]) -> Visit:
-        """Of the entry of ``summary.json``, in which None stands for NaN."""
+        """Make it from the entry of ``summary.json``, in which None stands for NaN."""
 
         def known(entries: Mapping[str, Any]) -> dict[str, Any]:
             return {key: math.nan if value is None else value for key, value in entries.items()}

@@ -104,7 +104,7 @@ class Config:
     workers : int or None
         Processes; None for one per core, 0 for this process alone.
     memory_limit : float or None
-        Of each worker, bytes; None for an equal share of the machine's.
+        Memory of each worker, bytes; None for an equal share of the machine's.
     spectra : tuple of str
         Spectra of planets for the search over the filters of a star, see `combine`; empty for its
         defaults.
@@ -277,7 +277,7 @@ class _Reader:
         }
 
     def options(self, given: dict[str, Any], default: Options, place: str) -> Options:
-        """Options of a table, whose values they are taken from."""
+        """Options of a table, taken out of its values."""
         own = {each.name: given.pop(each.name) for each in fields(Options) if each.name in given}
         if "settings" in own:
             # Settings of a sequence come on top of the survey's.

@@ -45,7 +45,7 @@ class Job:
 
     # Hash of the package's version, the content of the input files, and the options.
     key: str
-    # Of the sequence, by default target and filter, with the date of the epoch if it has several.
+    # Name of the sequence, by default target and filter, with the date of an epoch among several.
     name: str
     # Frames.
     files: tuple[str, ...]
@@ -61,7 +61,7 @@ class Job:
     injection: Injection | None = None
     # Key of the job whose fit an injection starts from.
     base: str | None = None
-    # Of the package.
+    # Version of the package.
     version: str = __version__
 
     @property
