@@ -136,7 +136,7 @@ def fetch_calints(
 
     Files that are in the folder with the size that the archive states are not fetched again. The
     archive does not state with which version of the calibration (CAL_VER in the header) a file was
-    made: delete those that are to be replaced by newer ones.
+    made: delete the files that are to be replaced by newer ones.
 
     Parameters
     ----------

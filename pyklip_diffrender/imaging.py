@@ -52,7 +52,7 @@ def interpolation_matrix(places: NDArray[np.float64], shape: tuple[int, int]) ->
     its edges.
     """
     ny, nx = shape
-    # Lanczos' kernel over 3 pixels to each side, the product of those in x and y.
+    # Lanczos' kernel over 3 pixels to each side, the product of kernels in x and y.
     steps = np.arange(1 - _KERNEL_REACH, 1 + _KERNEL_REACH)
     first = np.floor(places).astype(np.int64)
     columns, rows = (first[:, k, None] + steps for k in (0, 1))

@@ -233,7 +233,7 @@ class SharedOptions:
             spectrum: Jy, text such as "403 mJy", or an AB magnitude such as "9.8 mag(AB)".
             Contrasts then refer to it, as spaceKLIP's do. By
             default the light that is diffracted around the mask determines the star's flux, to
-            10 %, which errors of contrasts include; a value that differs from that by more than a
+            10 %, which errors of contrasts include; a value that differs from it by more than a
             factor of three is refused after the fit, before the search. Flux densities of planets
             do not depend on it. Takes a second, shorter fit.""",
         "expected": "a flux density in Jy, such as 0.45",

@@ -407,7 +407,7 @@ def limits_table(
             ("spectrum", np.array(names, dtype="U60"), None, "", "of the planet"),
             ("separation", np.array(places, dtype=float), u.arcsec, ".2f", "from the star"),
             ("filter", np.array(best, dtype="U12"), None, "",
-             "to which the contrast refers: that in which such a planet is seen best"),
+             "to which the contrast refers: the one in which such a planet is seen best"),
             ("contrast", np.array(contrasts, dtype=float), None, ".3e",
              "of a planet that reaches the threshold, median of the ring"),
             ("delta_mag", magnitudes(np.array(contrasts, dtype=float))[0], u.mag, ".3f",

@@ -478,7 +478,7 @@ def _fit_sources(
 ) -> _Sources:
     """Sources in the frames of a fit, to which the light of `start` is added again.
 
-    With `only_extended`, those that are point sources are left out after the fit.
+    With `only_extended`, point sources are left out after the fit.
     """
     ((linear, templates),) = groups_of([fit])
     images = templates.at_pixels(*pixels)

@@ -114,7 +114,7 @@ def with_raised_peaks(
 ) -> list[Refinement] | None:
     """Refine the star again with the candidates and one of the highest peaks as companions.
 
-    The fits are those with the companion that lowers chi-squared most, or the first that explain
+    The fits have the companion that lowers chi-squared most, or the first that explain
     the data. None if none lowers it enough, or if the fits explain their data already.
     """
     if not _unexplained(fits):

@@ -540,8 +540,8 @@ class Detection:
         angle there is also astrometry.csv, see `write_astrometry`. Extensions of detection.fits:
 
         - SNR, RESIDUAL_SNR: S/N of a point source at every pixel, and with the candidates removed;
-        - CONTRAST, CONTRAST_ERROR, PHOTON_ERROR: contrast, its standard deviation, and that for a
-          known star;
+        - CONTRAST, CONTRAST_ERROR, PHOTON_ERROR: contrast, its standard deviation, and the one for
+          a known star;
         - ERROR_FACTOR, FREEDOM: factor of the errors, and degrees of freedom of Student's t, which
           noise follows in units of these errors;
         - HAS_LIMITS: 1 for the pixels whose limits are in the contrast curve, else 0;

@@ -137,7 +137,7 @@ class Templates:
     def _near(self, k: int, offsets: Tensor) -> Tensor:
         """Sources in frame k, each moved to the nearest of the places in `_points`.
 
-        Those that are not on the detector have no light.
+        Sources that are not on the detector have no light.
         """
         detector = self.frames[k].model.detector
         # In thirds of a pixel, a place is 3 times the nearest pixel plus -1, 0 or 1.

@@ -245,7 +245,7 @@ def frames_of(
 ) -> Frames:
     """Gather the target's frames of one wavelength with their errors, masks and metadata.
 
-    `imgs` (n, ny, nx) are frames `index` of ``dataset.input``, before any high-pass filter. Those
+    `imgs` (n, ny, nx) are frames `index` of ``dataset.input``, before any high-pass filter. Frames
     that `admit` excludes stay NaN in the products. Raises NoValidPixelsError if no frame has a
     valid pixel.
     """

@@ -261,7 +261,7 @@ _STAMP = 0.45
 
 @dataclass(frozen=True)
 class ReportPictures:
-    """The pictures of a report, by section; those that a reduction does not have are missing."""
+    """The pictures of a report, by section; pictures that a reduction does not have are missing."""
 
     overview: Pictures = ()
     curve: Pictures = ()

@@ -185,7 +185,7 @@ def _star(detection: Detection) -> dict[str, Any] | None:
 
 
 def _candidates(reduction: ReductionResult) -> list[dict[str, Any]]:
-    """Candidates; those that look like extended light have no false-alarm probability."""
+    """Candidates; the ones that look like extended light have no false-alarm probability."""
     rows = plain_rows(reduction.detection.candidates)
     if reduction.extended:
         rows = [each | {"false_alarm_probability": None} for each in rows]
