@@ -90,7 +90,7 @@ SITUATIONS = (
     Situation(
         "two rolls", "Fits one wavefront to both, with the pattern of the library. Without one, "
         "the rolls share a pattern of unknown values.", {}, "",
-        f"Limits [beside those of KLIP]({_DATA}), and KLIP's curve in the report.",
+        f"Limits [beside KLIP's]({_DATA}), and KLIP's curve in the report.",
     ),
     Situation(
         "a reference star, one frame", "Where the library has the pattern, the frame is for KLIP "
@@ -105,7 +105,7 @@ SITUATIONS = (
     Situation(
         "reference stars of other epochs or programmes", "They teach the pattern where the library "
         "has none, and are in KLIP's curve.", {"systematics": "references"},
-        "to learn from them beside the library. Give their files with those of the target.",
+        "to learn from them beside the library. Give their files with the target's.",
         "A fit of each star at each epoch, as long as the target's.",
     ),
     Situation(

@@ -76,8 +76,8 @@ def list_calints(
     Returns
     -------
     QTable
-        file, filter, size (MB), access ("PUBLIC", or that of proprietary data), whether the file is
-        complete in the folder, and the archive's uri.
+        file, filter, size (MB), access ("PUBLIC", or MAST's word for proprietary data), whether the
+        file is complete in the folder, and the archive's uri.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def fetch_calints(
 
     Files that are in the folder with the size that the archive states are not fetched again. The
     archive does not state with which version of the calibration (CAL_VER in the header) a file was
-    made: delete those that are to be replaced by newer ones.
+    made: delete the files that are to be replaced by newer ones.
 
     Parameters
     ----------
@@ -262,7 +262,7 @@ def _chosen(observed: Table, target: str | None, filter: str | None) -> Table:
 
 
 def _is_calints(row: Any, filter: str | None) -> bool:
-    """Whether a product is a calints file; associations also list those of other filters."""
+    """Whether a product is a calints file; associations also list files of other filters."""
     filters = str(row["filters"]).split(";") if "filters" in row.colnames else []
     return str(row["productFilename"]).endswith("_calints.fits") and (
         filter is None or not filters or any(same_name(filter, each) for each in filters)

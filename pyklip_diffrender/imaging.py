@@ -16,8 +16,8 @@ behind the mask, whose images differ from P, and those that resemble starlight k
 
 Rolls are weighted by their noise, nothing is interpolated before noise and star are known, and
 structure that is fixed on the detector is not taken for sky, because it does not turn with it. The
-estimate is linear in the data, and its covariance and its response to a source are those of a
-linear filter, in closed form. See section 2.7 and chapter 2 of C. E. Rasmussen and C. K. I.
+estimate is linear in the data, so that its covariance and its response to a source have a
+closed form. See section 2.7 and chapter 2 of C. E. Rasmussen and C. K. I.
 Williams, "Gaussian Processes for Machine Learning" (2006).
 """
 
@@ -52,7 +52,7 @@ def interpolation_matrix(places: NDArray[np.float64], shape: tuple[int, int]) ->
     its edges.
     """
     ny, nx = shape
-    # Lanczos' kernel over 3 pixels to each side, the product of those in x and y.
+    # Lanczos' kernel over 3 pixels to each side, the product of kernels in x and y.
     steps = np.arange(1 - _KERNEL_REACH, 1 + _KERNEL_REACH)
     first = np.floor(places).astype(np.int64)
     columns, rows = (first[:, k, None] + steps for k in (0, 1))
@@ -78,7 +78,7 @@ Light = Sequence[Mapping[int, Tensor]]
 
 _STRENGTH = 0.8
 """S/N of a source of one standard deviation of the prior. With less, the image is deeper and not as
-sharp, in the limit that of a matched filter; with more, it is sharper and noisier."""
+sharp, in the limit a matched filter's; with more, it is sharper and noisier."""
 
 _BEAM = 0.7
 """FWHM of the beam, lambda/D. With what the prior blurs, a point source has 1.3 to 1.4 lambda/D, as
@@ -88,7 +88,7 @@ _REACH = 10.0
 """lambda/D from the middle of a point source's image to where it is cut."""
 
 _MARGIN = 1.45
-"""Side of the sky over that of the frames, which turn in it."""
+"""Side of the sky over the side of the frames, which turn in it."""
 
 _SMOOTH = 2.0
 """Pixels over which the noise is averaged for the prior."""
@@ -108,7 +108,7 @@ _PROBES = 24
 """Fields of random signs from which the error is estimated, to 3 to 10 %."""
 
 _FEW = 4
-"""Number of places in a ring below which its value is that of its neighbours."""
+"""Number of places in a ring below which it takes its neighbours' value."""
 
 _BATCH = 12
 """Right-hand sides that are solved together."""
@@ -257,7 +257,7 @@ class SkyModel:
     def estimate(self, light: Light | None = None) -> Image:
         """Posterior mean of the sky, (k, ny, nx), seen with the beam.
 
-        `light` is data minus star, (k, ny, nx) by frame for every fit; that of the fits by default.
+        `light` is data minus star, (k, ny, nx) by frame for every fit; by default from the fits.
         """
         images = self.light() if light is None else light
         return self._seen(self._prior * self._solved(self._prior * self._collected(images)))
@@ -281,9 +281,9 @@ class SkyModel:
 
     def error(self, seed: int = 0) -> Image:
         """Standard deviation of the estimate by the frames' noise, by separation, (ny, nx)."""
-        # With A = (1 + B^T Sigma^-1 B)^-1, the covariance of u is A - A^2. The diagonal of that of
-        # the image, Q, is the expectation of z * (Q z) for random signs z (C. Bekas, E. Kokiopoulou
-        # and Y. Saad 2007, Applied Numerical Mathematics 57, 1214).
+        # With A = (1 + B^T Sigma^-1 B)^-1, the covariance of u is A - A^2. The diagonal of the
+        # image's covariance, Q, is the expectation of z * (Q z) for random signs z (C. Bekas,
+        # E. Kokiopoulou and Y. Saad 2007, Applied Numerical Mathematics 57, 1214).
         covered = sum(m.sum(axis=0) for part in self._onto_frames for m in part.values())
         # The prior is wide where no frame is, so that those places would hide all others.
         inside = np.asarray(covered).reshape(self.shape) > 0.5
@@ -334,7 +334,7 @@ class SkyModel:
             sums: dict[int, list[Tensor]] = {k: [] for k in templates.frames}
             for each, chosen in enumerate(members):
                 images = templates.at_pixels(rows[chosen], columns[chosen])
-                # Those behind the mask would otherwise be lost among the others.
+                # Sources behind the mask would otherwise be lost among the others.
                 peak = peaks.setdefault(each, images[min(images)].double().amax(dim=(1, 2)))
                 weight = torch.from_numpy(signs[chosen]) / peak
                 for k, image in images.items():

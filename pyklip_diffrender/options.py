@@ -43,7 +43,7 @@ class Option:
     meaning : str
         Full description, for docstrings and the documentation.
     kind : type
-        Type of plain values; that of the default, unless that is None.
+        Type of plain values; by default the type of `default`, unless it is None.
     least : int
         Smallest value of an int.
     most : float
@@ -198,9 +198,9 @@ class SharedOptions:
     })  # fmt: skip
     references: References = field(default="joint", metadata={
         "choices": get_args(References),
-        "meaning": """Use of the frames of reference stars. With "joint" those of the target's epoch
-            are fitted together with the target's, in one likelihood, if that makes the limits
-            deeper, and those of other epochs teach the flat-field pattern where the library has
+        "meaning": """Use of the frames of reference stars. With "joint" frames of the target's
+            epoch are fitted together with the target's, in one likelihood, if that makes the limits
+            deeper, and frames of other epochs teach the flat-field pattern where the library has
             none; with "pattern" all of them do; with "off" they are not used. With `disk`, "joint"
             stands for "pattern".""",
         "help": """Use of the frames of reference stars: in one likelihood with the target's, for
@@ -213,11 +213,11 @@ class SharedOptions:
         "meaning": """Search the whole frames as well, see `wide_field`: of frames of the whole
             detector, the field of the mask, 20 arcsec wide. If sources beyond the fitted pixels are
             bright enough to be seen in these, the star is fitted once more without their light.""",
-        "help": "Search the whole frames as well, to their edge or that of the mask's field.",
+        "help": "Search the whole frames as well, to their edge or the edge of the mask's field.",
     })  # fmt: skip
     disk: bool = field(default=False, metadata={
         "meaning": """Fit extended light about the star, see `fit_disk`, and search the frames
-            without it. The limits are those of the positions where a planet would not be taken for
+            without it. The limits are for positions where a planet would not be taken for
             a part of it.""",
         "help": "Fit extended light about the star, such as a disk, together with the star.",
     })  # fmt: skip
@@ -233,7 +233,7 @@ class SharedOptions:
             spectrum: Jy, text such as "403 mJy", or an AB magnitude such as "9.8 mag(AB)".
             Contrasts then refer to it, as spaceKLIP's do. By
             default the light that is diffracted around the mask determines the star's flux, to
-            10 %, which errors of contrasts include; a value that differs from that by more than a
+            10 %, which errors of contrasts include; a value that differs from it by more than a
             factor of three is refused after the fit, before the search. Flux densities of planets
             do not depend on it. Takes a second, shorter fit.""",
         "expected": "a flux density in Jy, such as 0.45",
@@ -243,7 +243,7 @@ class SharedOptions:
     })  # fmt: skip
     star_flux_error: float = field(default=0.05, metadata={
         "most": 1.0,
-        "meaning": """Relative error of `star_flux`, at most 1, with that of the photometric
+        "meaning": """Relative error of `star_flux`, at most 1, including the photometric
             calibration of the frames.""",
         "expected": "a relative error of at most 1, such as 0.05 for 5 %",
         "help": "Relative error of --star-flux, at most 1.",
@@ -290,7 +290,7 @@ class ReduceOptions(SharedOptions):
 
     settings: GaussNewton | None = field(default=None, metadata={
         "stated_type": "GaussNewton, optional",
-        "meaning": "Settings of the fits; default those of `refine`.",
+        "meaning": "Settings of the fits; by default as in `refine`.",
         "not_on_command_line": "an object of Python",
         "not_in_surveys": "they have a table with the arguments of GaussNewton",
     })  # fmt: skip

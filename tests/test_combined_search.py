@@ -232,9 +232,9 @@ def test_frames_count_once():
     both = dr.combine([one, again, other])
     assert [each.filter for each in both.maps] == ["F444W", "F356W"]
     ((name, reason),) = both.left_out
-    assert (name, reason) == ("F444W 2023-02-25 (2)", "its frames are those of F444W 2023-02-25")
+    assert (name, reason) == ("F444W 2023-02-25 (2)", "its frames are also in F444W 2023-02-25")
     np.testing.assert_array_equal(both.snr, dr.combine([one, other]).snr)
-    with pytest.raises(IncompatibleSetupError, match=r"of which 1 can be used.*are those of"):
+    with pytest.raises(IncompatibleSetupError, match=r"of which 1 can be used.*are also in"):
         dr.combine([one, again])
 
 

@@ -542,7 +542,7 @@ def test_what_cannot_be_searched_together_is_said(tmp_path, command, capsys, mon
     config = inputs(tmp_path / "data", 1)
     config["sequence"].append({**config["sequence"][0], "name": "wide", "wide": True})
     (twice,) = run_survey(config, tmp_path / "twice", searching).meta["combined"]
-    assert "its frames are those of F444W 2023-02-25" in twice["reason"]
+    assert "its frames are also in F444W 2023-02-25" in twice["reason"]
     monkeypatch.setitem(SEARCHED, "star1_calints", later)
     assert command(searching, 2) == 0
     words = "no combined search: combine: got reductions of several epochs"

@@ -423,7 +423,7 @@ def test_maps_are_those_of_the_fit_about_the_star_and_are_written(searched, tmp_
 @pytest.mark.slow
 def test_other_frames_are_refused(searched):
     detection, frames, _ = searched
-    with pytest.raises(IncompatibleSetupError, match="expected those of the fit"):
+    with pytest.raises(IncompatibleSetupError, match="expected the fitted ones"):
         wide_field(detection, frames[:1])
     with pytest.raises(IncompatibleSetupError, match="before they were cut"):
         wide_field(detection, [each.cutout(40) for each in frames])

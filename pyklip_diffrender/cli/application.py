@@ -54,7 +54,7 @@ Examples:
   pyklip-diffrender demo --contrast 3e-7 --separation 1 -o faint""",
 )
 @option("--contrast", type=click.FloatRange(min=0), default=1e-6, show_default=True,
-        metavar="RATIO", help="Flux of the planet over that of the star.")  # fmt: skip
+        metavar="RATIO", help="Flux of the planet over the star's.")  # fmt: skip
 @option("--separation", type=click.FloatRange(0, 2.3), default=0.6, show_default=True,
         metavar="ARCSEC", help="Separation of the planet from the star.")  # fmt: skip
 @option("--hours", type=click.FloatRange(min=0), default=40.0, show_default=True, metavar="H",
@@ -507,8 +507,8 @@ def check_machine() -> str:
 def check_fit(**settings: Any) -> str:
     """Simulate a telescope whose segments have moved, and refine its wavefront.
 
-    `settings` are those of `GaussNewton`, besides the basis. Raises RefinementError if the fit is
-    not as good as it should be.
+    `settings` are arguments of `GaussNewton`, besides the basis. Raises RefinementError if the fit
+    is not as good as it should be.
     """
     import numpy as np
     import torch

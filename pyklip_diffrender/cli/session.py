@@ -123,7 +123,7 @@ class Run:
 
     # Whether to show progress bars.
     progress: bool = False
-    # Of PyTorch.
+    # Device of PyTorch.
     device: str = ReduceOptions.device
     _output: Path | None = None
     _before: dict[Path, int] = field(default_factory=dict)
@@ -255,7 +255,7 @@ def require_in_place(*outputs: OutputFolder) -> None:
 
 
 def _require_no_broken_link(path: Path, option: str) -> None:
-    """Refuse a path of which a part is a link that leads nowhere, or in a circle."""
+    """Refuse a path with a link in it that leads nowhere, or in a circle."""
     for part in (*reversed(path.absolute().parents), path.absolute()):
         if part.is_symlink() and not os.path.exists(part):
             raise IncompatibleSetupError(
@@ -477,7 +477,7 @@ together = _all(
                 "Default: blackbody, flat and free."),
     option("--proper-motion", nargs=2, metavar="EAST NORTH", section="Filters and epochs",
            help='Proper motion of the star, to tell companions from background sources: arcsec per '
-                'year, or with a unit, such as "377 mas/yr". Default: that of the headers.'),
+                'year, or with a unit, such as "377 mas/yr". Default: from the headers.'),
     option("--parallax", metavar="ANGLE", section="Filters and epochs",
            help='Parallax of the star, for the motion of background sources and of orbits between '
                 'epochs: arcsec, or with a unit, such as "45 mas". Default: neglected.'),

@@ -1,6 +1,6 @@
 """Detection of point sources with the wavefront marginalised.
 
-The image of a planet can resemble that of a wavefront error. A fit of the star alone then absorbs
+The image of a planet can resemble a wavefront error. A fit of the star alone then absorbs
 part of the planet, and the subtracted frame has lost an unknown fraction of its light. Here the
 flux of a planet is estimated together with all parameters of the star, in closed form. The result
 is unbiased, and its error includes the uncertainty of the wavefront.

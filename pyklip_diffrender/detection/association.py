@@ -56,11 +56,11 @@ kpc. Galaxies have none."""
 
 _ORBITAL_SPEED = 0.5
 """Standard deviation of the velocity of a companion in each direction on the sky, over the speed of
-a circular orbit of the radius that is its projected separation. It is 0.47 for orbits of any
+a circular orbit whose radius is its projected separation. It is 0.47 for orbits of any
 orientation with eccentricities up to 0.9."""
 
 _ORBITAL_FREQUENCIES = np.array([0.34, 0.69, 0.89, 0.99])
-"""Angular frequencies of orbits over that of a circular orbit of the radius that is the projected
+"""Angular frequencies of orbits, relative to a circular orbit whose radius is the projected
 separation: (sin t)^1.5 at the middles of the quarters of the distribution of the angle t between
 the line of sight and the companion."""
 
@@ -80,7 +80,7 @@ _FLUX_RANGE = math.log(1e3)
 """Logarithm of the ratio of the largest flux of sources to the smallest; log F is uniform."""
 
 _NEGLIGIBLE = 1e-4
-"""Likelihood of two sightings as one source, over that as two, below which they are two."""
+"""Likelihood of two sightings as one source over two sources, below which they are two."""
 
 _MOST_ASSOCIATIONS = 2000
 """Associations that are kept while sightings are added, the most probable ones."""
@@ -250,7 +250,7 @@ class Source:
 class Association:
     """All one-to-one associations of sightings at several epochs.
 
-    `dates` are those of the epochs, MJD, `area` is the area of the field, arcsec^2, and `unseen`
+    `dates` are the epochs' dates, MJD, `area` is the area of the field, arcsec^2, and `unseen`
     says what the map of an epoch without a sighting says of a source.
     """
 
@@ -293,7 +293,7 @@ class Association:
         return bool(logsumexp(self._seen((one, other))) > math.log(_NEGLIGIBLE))
 
     def _of_group(self, members: list[int], linked: NDArray[np.bool_]) -> Iterator[Source]:
-        """Sources among sightings of which no other can be a part."""
+        """Sources made of the sightings `members`, to which no other sighting can belong."""
         members = sorted(members, key=lambda k: self._sightings[k].epoch)
         # Each with the logarithm of its probability, as far as the sightings decide.
         kept: list[tuple[float, tuple[Track, ...]]] = [(0.0, ())]
@@ -360,7 +360,7 @@ class Association:
             full = covariance[np.ix_(index, index)] + block_diag(*(e.covariance for e in own))
             away = places - mean[index]
             _, size = np.linalg.slogdet(2 * math.pi * full)
-            # The density of the places if m has the density 1, not that of the wide Gaussian.
+            # The density of the places if m has the density 1, not the wide Gaussian's.
             density = -(away @ np.linalg.solve(full, away) + size) / 2
             density += math.log(2 * math.pi * _FLAT)
             logs[kind] = density + (len(own) - 1) * math.log(self._area) + flux

@@ -44,7 +44,7 @@ class Candidates:
     # known.
     covariance: Tensor
     # (k,), standard deviations of the contrasts for known positions, as in a map of S/N; 0 where
-    # not known. Those in `covariance` include what the uncertain positions add.
+    # not known. Errors in `covariance` include what the uncertain positions add.
     detection_errors: Tensor
     converged: bool = True
 
@@ -350,8 +350,8 @@ sources above the threshold are known to a tenth of it."""
 
 _SIMILAR = 0.1
 _SIGMAS = 5.0
-"""Relative difference of their contrasts, and in standard deviations of that of the companion,
-beyond which the fit has not found the source."""
+"""Largest difference of the contrasts of companion and candidate, relative and in the companion's
+standard deviations, with which the fit has found the source."""
 
 
 def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool:
@@ -370,8 +370,8 @@ def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool
 def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
     """Which sources (k, 2), x, y from the star, have light in the derivatives of the fit, (k,).
 
-    Errors of such a source from the linear model contain those of the star and of the source's
-    image already.
+    Errors of such a source from the linear model already contain the star's errors and the
+    errors of the source's image.
     """
     fit = templates.fit
     first = fit.frames[0].observation
@@ -383,7 +383,7 @@ def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
 def unconfirmed_companions(
     fits: Sequence[Refinement], candidates: Candidates
 ) -> NDArray[np.float64]:
-    """Companions of the fits of the target that are none of the candidates, (k, 3).
+    """Companions of the target's fits that are not among the candidates, (k, 3).
 
     Contrast, and x and y from the star in the first frame of their fit, arcsec; candidates'
     positions refer to the first frame of the first fit.
@@ -462,8 +462,8 @@ def without_light(
 #     do = (B C^-1 B^T)^-1 B C^-1 dI/du du
 #
 # is the error of the offset for an error du, where I is the image of the source and B has its
-# derivatives by flux, x and y, in all frames. The covariance of the offsets is that of the
-# unknowns, propagated.
+# derivatives by flux, x and y, in all frames. The covariance of the offsets follows from
+# the covariance of the unknowns.
 
 _STEP = 2e-3
 """arcsec between images whose difference is a derivative, in single precision."""
@@ -481,15 +481,15 @@ def with_position_of_star(
     if not count:
         return candidates
     # The star's unknowns and the noise in the candidates' pixels are taken as independent. Errors
-    # of a companion whose light counts in the derivatives by the star's unknowns contain that of
-    # the star already, and do not change.
+    # of a companion whose light counts in the derivatives by the star's unknowns already
+    # contain the star's errors, and do not change.
     places = candidates.offsets if place is None else place[None]
     rates = [_rates(groups, each) for each in places]
     covariance = candidates.covariance.clone()
     for k, (_, templates) in enumerate(groups):
         changes = torch.stack([each[k] for each in rates], dim=2).expand(-1, -1, count)
         changes = torch.where(in_derivatives(templates, candidates.offsets), 0.0, changes)
-        # A companion whose place is not known says nothing about that of the star.
+        # A companion whose place is not known says nothing about the place of the star.
         linear = templates.fit.linear
         of_star = torch.tensor([each.name != "companions" for each in linear.unknowns])
         combinations = torch.zeros(len(of_star), 2 * count, dtype=torch.float64)
@@ -573,7 +573,7 @@ def calibration_errors(
     Below a S/N of 25 the image is taken as known, because noise dominates.
     """
     count = len(offsets)
-    # A contrast is the flux of the source over that of the star. The source is measured with an
+    # A contrast is the flux of the source over the star's. The source is measured with an
     # image that depends on the wavefront, so errors of the wavefront and of the star's flux change
     # the contrast in proportion. They do not change the significance of a source. Both come from
     # the same posterior and may partly cancel. In real frames the posterior understates the error

@@ -58,7 +58,7 @@ class CombinedSource:
     false_alarm: float
     spectrum: str
     snr: float  # With that spectrum.
-    chi2: float  # Of the fluxes about the best listed spectrum; NaN without one.
+    chi2: float  # Chi-squared of the fluxes about the best listed spectrum; NaN without one.
     fluxes: SkyStack  # At the place, (filters,).
     hypotheses: Hypotheses | None
     # Date (MJD), place (2,) and covariance (2, 2) at each epoch where it was seen.
@@ -73,7 +73,7 @@ class Combination:
     ----------
     target : str
     maps : tuple of SkyMap
-        Of the reductions that were searched together.
+        Maps of the reductions that were searched together.
     left_out : tuple of (str, str)
         Reductions, and spectra of a file, that were not used, and why.
     spectra : PlanetSpectra
@@ -82,7 +82,7 @@ class Combination:
     free : bool
         Whether any spectrum without negative fluxes was searched as well.
     unit : "Jy" or "contrast"
-        Of the fluxes to which the spectra refer.
+        Unit of the fluxes to which the spectra refer.
     threshold : float
         S/N of a candidate of a single search.
     thresholds : dict of str to float
@@ -102,7 +102,7 @@ class Combination:
     grid : ndarray, (ny, nx, 2)
         East and north of the star of the pixels of `snr`, arcsec.
     snr : ndarray, (spectra, ny, nx)
-        Of a source with each spectrum that does not move; NaN where nothing is known.
+        S/N of a source with each spectrum that does not move; NaN where nothing is known.
     motion : Motion or None
         If there are several epochs.
     remarks : tuple of str
@@ -263,8 +263,8 @@ def candidates_table(
 ) -> QTable:
     """Make the table of candidates; see `Combination.candidates`.
 
-    `filters` are those of their fluxes, and `stars` has the flux of the star by filter, in their
-    unit: Jy, or contrast if `jansky` is False. `dated` says whether the epoch is known.
+    `filters` are the filters with fluxes, and `stars` has the flux of the star by filter, in the
+    same unit: Jy, or contrast if `jansky` is False. `dated` says whether the epoch is known.
     """
     count = len(sources)
     places = np.array([each.place for each in sources]).reshape(-1, 2)
@@ -310,14 +310,14 @@ def candidates_table(
         columns += [
             (f"contrast_{name}", snr * error / stars[name], None, ".3e", f"in {name}"),
             (f"contrast_error_{name}", error / stars[name], None, ".1e",
-             "without those of the star's flux and of the source's image"),
+             "without errors of the star's flux and of the source's image"),
             (f"snr_{name}", snr, None, ".1f", f"in {name} alone"),
         ]  # fmt: skip
         if jansky:
             columns += [
                 (f"flux_density_{name}", snr * error, u.Jy, ".3e", f"in {name}"),
                 (f"flux_density_error_{name}", error, u.Jy, ".1e",
-                 "without that of the calibration"),
+                 "without the calibration's error"),
             ]  # fmt: skip
     known = [each.hypotheses for each in sources if each.hypotheses is not None]
     if len(known) == count > 0:
@@ -407,7 +407,7 @@ def limits_table(
             ("spectrum", np.array(names, dtype="U60"), None, "", "of the planet"),
             ("separation", np.array(places, dtype=float), u.arcsec, ".2f", "from the star"),
             ("filter", np.array(best, dtype="U12"), None, "",
-             "to which the contrast refers: that in which such a planet is seen best"),
+             "to which the contrast refers: the one in which such a planet is seen best"),
             ("contrast", np.array(contrasts, dtype=float), None, ".3e",
              "of a planet that reaches the threshold, median of the ring"),
             ("delta_mag", magnitudes(np.array(contrasts, dtype=float))[0], u.mag, ".3f",

@@ -6,10 +6,10 @@ unknowns of the star marginalised. Different fits share no unknowns, so a source
 
     a = sum(s_f F_f / e_f^2) / sum(s_f^2 / e_f^2),    S/N = a sqrt(sum(s_f^2 / e_f^2)),
 
-where F_f and e_f are the flux density in a filter and its error: those of the joint likelihood of
+where F_f and e_f are the flux density in a filter and its error, by the joint likelihood of
 all frames. The spectrum is not known, and the highest S/N of a family of spectra has more trials
-than that of one, see `Family`. In what follows, places are offsets from the star to the east and to
-the north, arcsec.
+than one spectrum, see `Family`. In what follows, places are offsets from the star to the east and
+to the north, arcsec.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def combine(
     """Search the filters, arms and epochs of a star together.
 
     At every position the fluxes of the reductions and their errors are combined for each spectrum
-    of a family. The highest S/N of a family has more trials than that of one spectrum, and the
+    of a family. The highest S/N of a family has more trials than one spectrum, and the
     threshold is higher, so that a combined search has as many false candidates as a single one.
 
     Candidates of the single searches are known sources: their light is not searched again. Then
@@ -76,7 +76,7 @@ def combine(
     Parameters
     ----------
     reductions : sequence of Reduction, Detection or path
-        A path is that of a folder with the products of a reduction, of which ``detection.fits`` is
+        A path is a folder with the products of a reduction, whose ``detection.fits`` is
         read. A fit that does not explain its data takes part if its errors were scaled to the
         scatter of the S/N, as they are in real frames; `Combination.remarks` names it. A reduction
         whose frames another one has is left out.
@@ -234,8 +234,8 @@ def _require_one_star(detections: Mapping[str, Detection]) -> None:
         # Headers of simulated frames name no star.
         if one.is_known and two.is_known and not one.is_same(two):
             raise IncompatibleSetupError(
-                f"combine: got reductions of {first.target} and {other.target}, expected those of "
-                "one star"
+                f"combine: got reductions of {first.target} and {other.target}, expected "
+                "reductions of one star"
             )
 
 
@@ -264,7 +264,7 @@ def _usable(
         elif not np.isfinite(detection.error).any():
             reason = "it has no errors"
         elif frames in shown:
-            reason = f"its frames are those of {shown[frames]}"
+            reason = f"its frames are also in {shown[frames]}"
         if reason:
             left_out.append((name, reason))
             continue
@@ -302,7 +302,7 @@ def _spectra(
     unknown = ", ".join(each.name for each in maps if each.star is None)
     remark = (
         f"The star's flux density is not known ({unknown}), so that contrasts are not converted to "
-        "those of a planet's spectrum: the listed spectra are replaced by the star's own, the same "
+        "flux densities: the listed spectra are replaced by the star's own, the same "
         "contrast in all filters. Give the star's spectrum with star= (--star-sed)"
     )
     own = PlanetSpectra(("as the star",), filters, np.ones((1, len(filters))))

@@ -93,7 +93,7 @@ class _Value(NamedTuple):
 
     snr: float
     sigmas: float  # The S/N in Gaussian standard deviations.
-    error: float  # Of the contrast; inf where nothing is known.
+    error: float  # Error of the contrast; inf where nothing is known.
 
 
 @dataclass(frozen=True, eq=False)
@@ -549,7 +549,7 @@ class SourceSearch:
         return SkyStack.of_values(maps, self.spectra.filters, self.scales, values)
 
     def _below(self, group: Sequence[_Seen]) -> str:
-        """Remark about a candidate of a single search that is none of the combined search."""
+        """Remark about a candidate of a single search that the combined search lacks."""
         best = max(group, key=lambda each: each.sighting.snr)
         separation, names = float(np.hypot(*best.place)), ", ".join(best.values)
         return (

@@ -4,7 +4,7 @@ Frames of reference stars make limits of a target deeper near the star, where th
 them, and may make them shallower elsewhere, where their pattern is not quite the target's. Both
 fits are valid measurements. At every separation the one with the deeper stated limit is used. The
 choice rests on errors, not on the S/N, so that every pixel is searched once and thresholds and
-false-alarm probabilities are those of a single search.
+false-alarm probabilities of a single search apply.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pyklip_diffrender.detection.field import Image, is_within, separation_of
 from pyklip_diffrender.detection.search_result import Detection
 
 _SAME_SOURCE_LAMBDA_D = 0.5
-"""Distance of candidates of the two searches that are one source. The searches share the target's
+"""Largest distance of two searches' candidates that are one source. The searches share the target's
 frames, so that their positions of a source differ by less than the error of either, a tenth of
 lambda/D at S/N 5."""
 

@@ -418,7 +418,7 @@ def _fit_beside(path: Path) -> Refinement:
 def _groups_of(
     searched: Sequence[Refinement], digests: Sequence[str], path: Path
 ) -> tuple[Group, ...]:
-    """Linear models and templates of fits, if they are those of the detection in a file."""
+    """Linear models and templates of fits, if the detection in a file is of these fits."""
     if [digest(fit) for fit in searched] != list(digests):
         raise IncompatibleSetupError(
             f"{path}: the fit is not the one that was searched for this detection"

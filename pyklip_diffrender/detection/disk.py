@@ -54,7 +54,7 @@ from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
-# Which light of sources on a grid is extended, and which is that of point sources.
+# Which light of sources on a grid is extended, and which belongs to point sources.
 #
 # The brightness of the sources is smoothed by a beam of lambda/D. Of all straight lines of a given
 # length through a position, in all directions, one is brightest at its faintest point: that
@@ -246,7 +246,7 @@ class Disk:
         Parameters
         ----------
         ax : two Axes, optional
-            Default those of a new figure.
+            Axes to draw in; a new figure by default.
 
         Returns
         -------
@@ -342,7 +342,7 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
     Parameters
     ----------
     fit : Refinement
-        Of the target. The result's own has no companions: they are in its data.
+        Fit of the target. The result's own fit has no companions: they are in its data.
     inner : float or Quantity
         Smallest separation of sources, arcsec.
     progress : bool
@@ -478,7 +478,7 @@ def _fit_sources(
 ) -> _Sources:
     """Sources in the frames of a fit, to which the light of `start` is added again.
 
-    With `only_extended`, those that are point sources are left out after the fit.
+    With `only_extended`, point sources are left out after the fit.
     """
     ((linear, templates),) = groups_of([fit])
     images = templates.at_pixels(*pixels)

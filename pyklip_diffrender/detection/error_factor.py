@@ -79,7 +79,7 @@ _SETTLED = 1e-4
 """The fit ends when no parameter changes by more than this."""
 
 _ANGLES = 72
-"""Positions on a circle of which the median is the factor of a separation."""
+"""Positions per circle; the factor at a separation is their median."""
 
 
 _STRUCTURES = 0.3
@@ -90,7 +90,7 @@ of the S/N in which they become fewer by a factor of e. Eight rolls of G 7-34 an
 (programme 1184), each reduced alone with a library without its star, have 4 peaks of either sign
 above 4, two above 4.5 and none above 5, where noise at 1300 independent positions has 0.7, 0.07 and
 0.006; four rolls of another star have two candidates, of 5.5 and 5.9, with 2.6 and 3.2 in both of
-its rolls together. The numbers between and beyond are those of an exponential through these few."""
+its rolls together. The numbers between and beyond follow an exponential through these few."""
 
 
 def structures_in_single_roll(snr: ArrayLike) -> Image:
@@ -100,7 +100,7 @@ def structures_in_single_roll(snr: ArrayLike) -> Image:
 
 
 _COMPACT = 4.0
-"""Standard deviations by which the sum of a compact structure exceeds those of other places."""
+"""Standard deviations by which the sum over a compact structure exceeds sums elsewhere."""
 
 
 def compact_structures(pattern: Image, width: float) -> Image:
@@ -109,7 +109,7 @@ def compact_structures(pattern: Image, width: float) -> Image:
     Errors of the flat field are independent from pixel to pixel. Where neighbours agree over the
     width of a point source, pixels, the star's image has light that the model lacks.
     """
-    # Sums over the image of a point source, whose scatter is that of the flat field's errors.
+    # Sums over the image of a point source, whose scatter comes from the flat field's errors.
     reach = math.ceil(width)
     steps = np.arange(-reach, reach + 1) ** 2
     squares = np.add.outer(steps, steps)
@@ -164,7 +164,7 @@ class ErrorFactor:
         return _inverse(self._interpolated(1 / self.freedom, np.asarray(offsets)))
 
     def _interpolated(self, image: Image, offsets: Image) -> Image:
-        """Values of an image at positions; beyond the grid those of the nearest pixel."""
+        """Values of an image at positions; beyond the grid, the nearest pixel's."""
         if image.size == 1:
             return np.full(offsets.shape[:-1], image[0, 0])
         columns, rows = np.moveaxis(pixels_of(self.grid, offsets), -1, 0)
@@ -187,7 +187,7 @@ class ErrorFactor:
 
     @property
     def is_measured(self) -> bool:
-        """Whether it follows the scatter of the S/N, and not chi-squared alone."""
+        """Whether the factor follows the scatter of the S/N, and not chi-squared alone."""
         return bool(np.isfinite(self.freedom).any())
 
     @property
@@ -232,8 +232,8 @@ class ScatterModel:
 
     def evaluate(self, parameters: NDArray[np.float64]) -> tuple[Image, Image]:
         """Return log f^2, (n,), and its derivatives, (n, parameters)."""
-        # A is `quiet` and B q is `bright`: the change of log(A + B q) is the mean of those of log A
-        # and log B, weighted with the two terms.
+        # A is `quiet` and B q is `bright`: the change of log(A + B q) is the mean of the changes of
+        # log A and log B, weighted with the two terms.
         quiet = np.exp(_SPREAD * parameters[0])
         bright = np.exp(_STARLIGHT + _STARLIGHT_SPREAD * parameters[1]) * self.starlight
         share = quiet / (quiet + bright)
@@ -395,7 +395,7 @@ class Significance:
         """Pixel of the highest peak that is significant, judged by the scatter without it.
 
         `snr` (ny, nx) is before errors are multiplied, with the known sources at x, y, (k, 2),
-        removed. `threshold` is that in Gaussian noise; where the scatter is measured, the S/N
+        removed. `threshold` is for Gaussian noise; where the scatter is measured, the S/N
         that Student's t exceeds as rarely takes its place.
         """
         peaks = self.significant_peaks(snr, sources, threshold, allowed)
@@ -478,7 +478,7 @@ class Significance:
 
 def _derivatives(reach: int) -> tuple[Image, Image]:
     """Weights of samples -reach, ..., reach whose sums are the derivatives in the middle."""
-    # First and second derivatives of a function without frequencies beyond those of its samples,
+    # First and second derivatives of a band-limited function, sampled at its Nyquist rate,
     # which is the sum of sinc functions sin(pi x) / (pi x): these have the slope (-1)^k / k and the
     # curvature -2 (-1)^k / k^2 at k, and -pi^2 / 3 in the middle.
     places = np.arange(-reach, reach + 1)
@@ -519,8 +519,8 @@ def contrast_table(
     """Make the table of a 5-sigma contrast curve; separations and lambda/D are in arcsec.
 
     `errors` are standard deviations of contrasts at the pixels of each ring, multiplied by the
-    factor, and `photon` those for a known star. With the star's flux density, Jy, there is a column
-    of that of the median. `_COLUMNS` describes the columns.
+    factor, and `photon` the same for a known star. With the star's flux density, Jy, there is a
+    column of the median's flux density. `_COLUMNS` describes the columns.
     """
     rows = []
     # Where errors were scaled to the scatter of the S/N, noise follows Student's t, with as many

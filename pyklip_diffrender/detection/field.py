@@ -179,8 +179,8 @@ class Sky:
         Mean of the target's mid-exposures, UTC; None if no frame has a date.
     star : (float, float) or None
         Flux density of the star, as a catalogue states it or else as fitted, and its standard
-        deviation, Jy; None where the frames have no photometric calibration. The error is that of
-        the diffracted light or of the catalogue, without that of the calibration.
+        deviation, Jy; None where the frames have no photometric calibration. The error
+        includes the fit or the catalogue, but not the photometric calibration.
     vega : float or None
         Flux density of Vega magnitude 0 in the filter, Jy; None if it is not known.
     """
@@ -192,7 +192,7 @@ class Sky:
 
     @classmethod
     def of(cls, fits: Sequence[Refinement], scatter: float = 1.0) -> Sky:
-        """Of the frames of the target, with errors multiplied by `scatter`."""
+        """Relation of the target's frames to the sky, with errors multiplied by `scatter`."""
         first = fits[0].frames[0].observation
         frames = [f for fit in fits for f in fit.frames if not f.observation.reference]
         # Where the middle of an exposure is not known, its beginning is near enough for an orbit.

@@ -177,7 +177,7 @@ def candidate_table(
         *_correlations(covariance, contrast_error, sky),
         *_epoch(count, sky),
         ("frame_angle", positions.frame_angle, u.deg, ".2f",
-         "counter-clockwise from +y of the first frame; its error is that of the position angle"),
+         "counter-clockwise from +y of the first frame; its error is the position angle's"),
         ("x", positions.offsets[:, 0], u.arcsec, ".4f", "from the star on the first frame"),
         ("y", positions.offsets[:, 1], u.arcsec, ".4f", "from the star on the first frame"),
         ("x_error", x_error, u.arcsec, ".4f", "standard deviation"),
@@ -265,7 +265,7 @@ def _on_sky(positions: Positions, sky: Sky) -> Iterator[Column]:
 def _correlations(covariance: Image, contrast_error: Image, sky: Sky) -> Iterator[Column]:
     """Correlations with which errors of contrasts and offsets make a covariance (k, 3, 3).
 
-    The covariance is that of contrast, x and y; the error of the contrast has further parts.
+    The covariance is of contrast, x and y; the error of the contrast has further parts.
     """
     turn, names = np.eye(3), ("x", "y")
     if sky.north is not None:
@@ -283,8 +283,8 @@ def _correlations(covariance: Image, contrast_error: Image, sky: Sky) -> Iterato
 
 
 def _photometry(contrast: Image, error: Image, flux_error: Image, sky: Sky) -> Iterator[Column]:
-    yield "contrast", contrast, None, ".3e", "flux over that of the star, without coronagraph"
-    yield "contrast_error", error, None, ".1e", "with those of the star's flux and the image"
+    yield "contrast", contrast, None, ".3e", "flux over the star's, without coronagraph"
+    yield "contrast_error", error, None, ".1e", "with errors of the star's flux and the image"
     magnitude, magnitude_error = magnitudes(contrast, error)
     yield "delta_mag", magnitude, u.mag, ".3f", "magnitude difference to the star"
     yield "delta_mag_error", magnitude_error, u.mag, ".3f", "standard deviation"
@@ -292,13 +292,13 @@ def _photometry(contrast: Image, error: Image, flux_error: Image, sky: Sky) -> I
         return
     jansky, jansky_error = contrast * sky.star[0], flux_error * sky.star[0]
     yield "flux_density", jansky, u.Jy, ".3e", "in the photometric calibration of the frames"
-    yield "flux_density_error", jansky_error, u.Jy, ".1e", "without that of the calibration"
+    yield "flux_density_error", jansky_error, u.Jy, ".1e", "without the calibration's error"
     for system, zero in (("AB", _AB_ZERO), ("Vega", sky.vega)):
         if zero is not None:
             magnitude, magnitude_error = magnitudes(jansky / zero, jansky_error / zero)
             name = f"{system.lower()}_mag"
             yield name, magnitude, u.mag, ".3f", f"{system} magnitude of flux_density"
-            yield f"{name}_error", magnitude_error, u.mag, ".3f", "without that of the calibration"
+            yield f"{name}_error", magnitude_error, u.mag, ".3f", "without the calibration's error"
 
 
 def _epoch(count: int, sky: Sky) -> Iterator[Column]:

@@ -52,9 +52,9 @@ def annulus_snr(
     center : tuple of float
         x, y of the star.
     radius : float
-        Of the aperture about the planet, pixels.
+        Radius of the aperture about the planet, pixels.
     half_width : float
-        Of the annulus about the star, pixels.
+        Half of the width of the annulus about the star, pixels.
 
     Returns
     -------

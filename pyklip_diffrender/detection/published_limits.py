@@ -30,7 +30,7 @@ def published_limits(curve: QTable, detection: Any, isochrone: Any, parallax: An
     columns: list[Column] = [
         ("separation", curve["separation"].value, u.arcsec, ".2f", "from the star"),
         ("contrast", contrast, None, ".2e",
-         f"flux over that of the star at {curve.meta['sigmas']:g} sigma, median of all angles"),
+         f"flux relative to the star at {curve.meta['sigmas']:g} sigma, median of all angles"),
         ("dmag", magnitudes(contrast)[0], u.mag, ".2f", "magnitude difference to the star"),
     ]  # fmt: skip
     if sky.star is not None and sky.vega is not None:
@@ -50,7 +50,7 @@ def _masses(
     angle = checked_motion(None, parallax)[1]
     if not angle:
         raise IncompatibleSetupError(
-            f"parallax: got {parallax!r}, expected that of the star, such as '9.3 mas': models "
+            f"parallax: got {parallax!r}, expected the star's, such as '9.3 mas': models "
             "state absolute magnitudes, or fluxes at 10 pc"
         )
     if sky.star is None:

@@ -60,9 +60,9 @@ _STEP = 10.0
 class MeasuredPlanet(NamedTuple):
     """Measurement of a planet."""
 
-    # Of the candidate within 0.1 arcsec, or else measured at the place of the planet.
+    # Values of the candidate within 0.1 arcsec, or else measured at the place of the planet.
     contrast: float
-    contrast_error: float  # Without that of the star's flux.
+    contrast_error: float  # Without the error of the star's flux.
     snr: float
     detected: bool  # Whether there is such a candidate.
 
@@ -158,8 +158,8 @@ def measured_planet(
 ) -> MeasuredPlanet:
     """Measure a planet at a known place, x, y from the star in the first frame, arcsec.
 
-    `flux` is that of the star to which the contrast is relative, in the unit of `FrameFit.flux`: of
-    an injected planet, that of the fit with which it was rendered.
+    `flux` is the flux of the star to which the contrast is relative, in the unit of
+    `FrameFit.flux`; for an injected planet, the flux in the fit with which it was rendered.
     """
     sources, factor = detection.sources, detection.error_factor
     unit = detection.fits[0].frames[0].flux / flux
@@ -178,7 +178,7 @@ def measured_planet(
 def _free_place(detection: Detection, separation: float, angle: float) -> NDArray[np.float64]:
     """x, y at a separation, where there are limits and no candidate is near.
 
-    The first such place counter-clockwise from the angle; if there is none, that at the angle.
+    The first such place counter-clockwise from the angle; if there is none, the place at the angle.
     """
     table = detection.candidates
     candidates = np.stack([table["x"].value, table["y"].value], axis=-1)
@@ -200,7 +200,7 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
 # are found. Here planets of several contrasts are added to the frames, to first order: the maps of
 # a search are linear in the data, so that the light of a planet changes them by its contrast times
 # a map that is computed once for each place. Every map is then searched as if nothing were known of
-# the planet. The true-positive fraction is that of Jensen-Clem et al., AJ 155, 19 (2018), for the
+# the planet. The true-positive fraction is as in Jensen-Clem et al., AJ 155, 19 (2018), for the
 # false-positive fraction of the threshold.
 
 _STRENGTHS = tuple(np.geomspace(0.4, 3.0, 12).tolist())
@@ -208,7 +208,7 @@ _STRENGTHS = tuple(np.geomspace(0.4, 3.0, 12).tolist())
 
 
 _NEAR = 0.5
-"""Distance in lambda/D of a candidate from the planet that it is."""
+"""Largest distance of a candidate from the planet that it stands for, lambda/D."""
 
 _BATCH = 64
 """Number of planets whose maps are computed at a time."""

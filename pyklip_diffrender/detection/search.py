@@ -60,7 +60,7 @@ def side_lobes(
     """Which candidates are not significant beside a source within the inner limit, (k,).
 
     `snr` (ny, nx) is without the candidates, before errors are multiplied by the factor;
-    `threshold` is that in Gaussian noise, and `inner` the smallest separation of candidates,
+    `threshold` is for Gaussian noise, and `inner` the smallest separation of candidates,
     arcsec.
     """
     none = torch.zeros(len(candidates), dtype=torch.bool)
@@ -99,7 +99,7 @@ _LOWEST = 5.0
 """S/N of a peak that is tried, without a factor."""
 
 _BETTER = 0.9
-"""Largest ratio of chi-squared with a companion to that without it. A planet that ends a fit at a
+"""Largest ratio of chi-squared with to without a companion. A planet that ends a fit at a
 wrong wavefront dominates chi-squared; errors of the model do not go away with one companion."""
 
 _UNEXPLAINED = (Status.MODEL_MISMATCH, Status.ITERATION_LIMIT)
@@ -114,7 +114,7 @@ def with_raised_peaks(
 ) -> list[Refinement] | None:
     """Refine the star again with the candidates and one of the highest peaks as companions.
 
-    The fits are those with the companion that lowers chi-squared most, or the first that explain
+    The fits have the companion that lowers chi-squared most, or the first that explain
     the data. None if none lowers it enough, or if the fits explain their data already.
     """
     if not _unexplained(fits):
@@ -206,7 +206,7 @@ def detect(
         Separations of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     without_limits : ndarray of bool, (ny, nx), optional
         Pixels of the first frame that the contrast curve leaves out: see ``hides_points`` of
-        `Disk`. Separations of which no pixel is left have no row.
+        `Disk`. Separations without a pixel left have no row.
     relinearise : float
         S/N of a candidate above which the star is refined again with the candidates in the model,
         because bright sources bias the wavefront about which the model is linearised. Where a fit
@@ -355,7 +355,7 @@ def _false_alarms(outcome: _Outcome) -> NDArray[np.float64]:
 def _require_shape(actual: tuple[int, ...], expected: tuple[int, ...]) -> None:
     if actual != expected:
         raise IncompatibleSetupError(
-            f"without_limits: got the shape {actual}; expected that of the first frame, {expected}"
+            f"without_limits: got the shape {actual}; expected the first frame's, {expected}"
         )
 
 

@@ -115,7 +115,7 @@ class Detection:
     groups : tuple of (LinearModel, Templates)
         Linear model and templates of each fit of the target; empty without `fits`.
     contrast : ndarray, (ny, nx)
-        Flux of a point source at every pixel over that of the star, before the coronagraph.
+        Flux of a point source at every pixel over the star's, before the coronagraph.
     error : ndarray, (ny, nx)
         Standard deviation of `contrast`, with the factor `error_factor`.
     photon_error : ndarray, (ny, nx)
@@ -137,7 +137,7 @@ class Detection:
         Chi-squared per pixel, without the candidates, and error factor between separations.
     threshold : float
         Smallest S/N of a candidate in Gaussian noise. Where errors were scaled to the scatter of
-        the S/N, ``error_factor.threshold(threshold, offsets)`` is that at a position.
+        the S/N, ``error_factor.threshold(threshold, offsets)`` is the value at a position.
     contrast_curve : QTable
         See `contrast_curve`.
     has_limits : ndarray of bool, (ny, nx)
@@ -147,10 +147,10 @@ class Detection:
     path : Path or None
         File that the detection was read from.
     other : Detection or None
-        Search of another fit of the same frames, such as that of the target without reference
-        stars, where it is the deeper one at some separations.
+        Search with another fit of the same frames, such as the target without reference
+        stars, where that search is deeper at some separations.
     of_other : ndarray of bool, (ny, nx), or None
-        Pixels whose maps, candidates and limits are those of `other`, relative to the star of
+        Pixels whose maps, candidates and limits come from `other`, relative to the star of
         `fits`.
 
     Examples
@@ -258,11 +258,11 @@ class Detection:
         orientation there are the offsets in right ascension and declination and their correlation,
         with a date the epoch, and for calibrated frames the flux density and the AB magnitude.
 
-        Errors are standard deviations, with all parameters of the star marginalised. Those of
+        Errors are standard deviations, with all parameters of the star marginalised. Errors of
         positions include the error of the star's position behind the mask, and do not include
-        errors of the pixel scale and of the roll angle. The error of the contrast includes those of
+        errors of the pixel scale and of the roll angle. The contrast's error includes errors of
         the star's flux (10 % for real frames, unless ``reduce(star_flux=...)`` says it), of the
-        source's own image and of its position; that of the flux density does not depend on the
+        source's own image and of its position; the flux density's error does not depend on the
         star's flux. The S/N is the contrast over its error for a known position and image, because
         the others do not change the significance of a source.
         """
@@ -285,7 +285,7 @@ class Detection:
             unit), and one that is named like the filter, such as F444W or JWST_NIRCam.F444W, with
             absolute Vega magnitudes, AB magnitudes (unit mag(AB)), or flux densities at 10 pc.
         parallax : float, Quantity or str, optional
-            Of the star, arcsec or such as "9.3 mas"; needed with `isochrone`.
+            Parallax of the star, arcsec or such as "9.3 mas"; needed with `isochrone`.
 
         Returns
         -------
@@ -345,8 +345,8 @@ class Detection:
         Parameters
         ----------
         image : "contrast", "snr" or "subtracted"
-            The map of contrasts or of S/N, or a frame without its star, see `subtracted`. That of
-            S/N has no uncertainty.
+            The map of contrasts or of S/N, or a frame without its star, see `subtracted`. The map
+            of S/N has no uncertainty.
         frame : int
             Which of the frames, for "subtracted".
 
@@ -518,12 +518,12 @@ class Detection:
         """Draw the S/N map with the candidates, and the contrast curve.
 
         The map has north up and east left, in arcsec from the star, where the position angle of the
-        first frame is known; else it is that of the first frame, in x and y.
+        first frame is known; else it has x and y of the first frame.
 
         Parameters
         ----------
         ax : two Axes, optional
-            Default those of a new figure.
+            Axes to draw in; a new figure by default.
 
         Returns
         -------
@@ -540,8 +540,8 @@ class Detection:
         angle there is also astrometry.csv, see `write_astrometry`. Extensions of detection.fits:
 
         - SNR, RESIDUAL_SNR: S/N of a point source at every pixel, and with the candidates removed;
-        - CONTRAST, CONTRAST_ERROR, PHOTON_ERROR: contrast, its standard deviation, and that for a
-          known star;
+        - CONTRAST, CONTRAST_ERROR, PHOTON_ERROR: contrast, its standard deviation, and the one for
+          a known star;
         - ERROR_FACTOR, FREEDOM: factor of the errors, and degrees of freedom of Student's t, which
           noise follows in units of these errors;
         - HAS_LIMITS: 1 for the pixels whose limits are in the contrast curve, else 0;

@@ -1,8 +1,8 @@
 """Maps on the sky of several searches, their sums, and how often noise exceeds a level.
 
 Places are offsets from the star to the east and to the north, arcsec. Between the pixels of a
-search, S/N is interpolated with splines: where the pixels are as large as those of F356W, it
-differs from that of a template at the place by an rms of 0.13 or less.
+search, S/N is interpolated with splines: where the pixels are as large as in F356W, it
+differs from the S/N of a template at the place by an rms of 0.13 or less.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from pyklip_diffrender.io.units import east_and_north
 from pyklip_diffrender.scene.admission import EPOCH
 
 _ORDER = 5
-"""Of the splines between pixels. S/N maps have no higher frequencies than images, whose pixels are
-just small enough for them."""
+"""Order of the splines between pixels. S/N maps have no higher frequencies than images, whose
+pixels are just small enough for them."""
 
 LIGHT = 1.5
 """lambda/D from a source at which its light ends, and within which two peaks are one source."""
@@ -50,7 +50,7 @@ class MapSource:
     covariance: Image  # (2, 2), of the place, arcsec^2, with `POSITION`.
     snr: float
     sigmas: float  # The S/N in Gaussian standard deviations.
-    error: float  # Of the contrast, for a known image and a known flux of the star.
+    error: float  # Error of the contrast, for a known image and a known flux of the star.
     flux: tuple[float, float]  # Contrast and its error, with all that is not known.
 
 
@@ -202,11 +202,11 @@ class SkyMap:
     @cached_property
     def curvature(self) -> NDArray[np.float64]:
         """Covariance of the gradient of noise of standard deviation 1, (2, 2), per arcsec^2."""
-        # That is the curvature of the autocorrelation, to the east and to the north. Slopes are
+        # It is the curvature of the autocorrelation, to the east and to the north. Slopes are
         #
         #     f' = (f(-2 h) - 8 f(-h) + 8 f(h) - f(2 h)) / 12 h,
         #
-        # and their mean squares are divided by that of the noise.
+        # and their mean squares are divided by the mean square of the noise.
         spline = spline_filter(self.noise, order=_ORDER)
         used = np.isfinite(self.error) & (np.abs(self.noise) < 4)
         rows, columns = np.nonzero(used)
@@ -241,7 +241,7 @@ class SkyStack:
     snr: Image
     sigmas: Image
     error: Image
-    curvature: Image  # (filters, 2, 2), as that of `SkyMap`.
+    curvature: Image  # (filters, 2, 2), as in `SkyMap`.
 
     @classmethod
     def of(
@@ -477,9 +477,8 @@ class Family:
                     )
             return total
         # The expected number is a sum over dimensions of the curvatures of the searched set times
-        # the densities of the Euler characteristic. Those of the field are its area, half its
-        # perimeter, as if it were a square, and 1; those of field times arc are their products with
-        # the angle.
+        # the densities of the Euler characteristic. Curvatures of the field are its area, half its
+        # perimeter, as if it were a square, and 1; for field times arc, these times the angle.
         zero, one, two, three = (_density(d, level) for d in range(4))
         area = self._areas[0].sum()
         total = area * two + 2 * math.sqrt(area) * one + zero

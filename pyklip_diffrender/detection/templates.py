@@ -31,7 +31,7 @@ _WAVELENGTHS = 4
 _WIDTH = 0.1
 """Width of the part of a bandpass, as a fraction of its mean wavelength, that one wavelength stands
 for in the templates of a map. For the filters of NIRCam these differ by an rms of 1 to 3 % from
-those of the whole bandpass, and their amplitudes by 2e-4. Candidates are measured with all."""
+templates of the whole bandpass, and their amplitudes by 2e-4. Candidates are measured with all."""
 
 _DIFFERENCE = 5e-4
 """arcsec between images whose difference is a derivative; accurate to 1e-4."""
@@ -50,7 +50,7 @@ class Templates:
     """Images of planets in frames that were refined together, in the data's unit.
 
     Positions are x, y from the star in arcsec, in the frame `origin`. The others may be rolled and
-    have their stars at other positions. `frames` are those of the target, by their place in the
+    have their stars at other positions. `frames` are the target's, by their place in the
     fit.
     """
 
@@ -137,7 +137,7 @@ class Templates:
     def _near(self, k: int, offsets: Tensor) -> Tensor:
         """Sources in frame k, each moved to the nearest of the places in `_points`.
 
-        Those that are not on the detector have no light.
+        Sources that are not on the detector have no light.
         """
         detector = self.frames[k].model.detector
         # In thirds of a pixel, a place is 3 times the nearest pixel plus -1, 0 or 1.
@@ -237,7 +237,7 @@ def _as_tensor(opd: NDArray[np.float64]) -> Tensor:
 
 # Fits of one target, each with its linear model and its templates.
 #
-# The frames of a fit share unknowns, those of different fits do not. Therefore the information of
+# The frames of a fit share unknowns, frames of different fits do not. Therefore the information of
 # different groups adds.
 
 Group = tuple[LinearModel, Templates]

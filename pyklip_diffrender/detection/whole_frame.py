@@ -73,7 +73,7 @@ _FITTED = 9
 class WholeFrame:
     """A whole frame with the fitted star and the background removed."""
 
-    fit: FrameFit  # Of the star in the pixels about it.
+    fit: FrameFit  # Fit of the star in the pixels about it.
     observation: Observation  # The whole frame, of which the fit has a part.
     roll: float  # Rotation of the sky from the first frame to this one, degrees.
     # (k, 3), contrast, and x, y from the star in the first frame, of the sources that were found in
@@ -92,7 +92,7 @@ class WholeFrame:
 
     @cached_property
     def _bounds(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """First and last column, and row, of which at least half of the pixels are valid."""
+        """First and last column, and row, with at least half of their pixels valid."""
         valid = self.observation.combined().valid[0]
         lines = [np.flatnonzero(valid.mean(axis=axis) >= 0.5) for axis in (0, 1)]
         columns, rows = ((int(k[0]), int(k[-1])) if len(k) else (0, -1) for k in lines)
@@ -128,7 +128,7 @@ class WholeFrame:
         combined = self.observation.combined()
         image = np.asarray(combined.data[0] - self.stars)
         separation = separation_of(self.grid)
-        # Of a small frame, its outer part.
+        # In a small frame, its outer part is used.
         core = min(_CORE, 0.7 * float(separation[combined.valid[0]].max()))
         unused = ~combined.valid[0] | (separation < core)
         ground = Background2D(
@@ -149,10 +149,10 @@ class WholeFrame:
         middle = _KERNEL // 2
         cross = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
         window = (slice(middle - 1, middle + 2),) * 2
-        # An outlier is brighter than its neighbours allow: of all positions of a source, that in
+        # An outlier is brighter than its neighbours allow: a source in
         # the middle of a pixel leaves the neighbours least of its light, a mean of `share` of the
         # peak. A pixel may therefore have the mean of its neighbours over `share`, whose variance
-        # is that of a pixel over 4 share^2.
+        # is the variance of a pixel over 4 share^2.
         share = (self.kernel[window] * cross).sum() / self.kernel[middle, middle]
         allowed = np.maximum(convolve(self.residual, cross), 0.0) / share
         uncertain = _OUTLIER * combined.error[0] * math.sqrt(1 + 0.25 / share**2)
@@ -273,7 +273,7 @@ class WholeFrame:
 
         def image(offset: Image, covariance: Image) -> Image:
             x, y = self.pixels_of(offset)
-            # The transform of a Gaussian of covariance S is exp(-2 pi^2 k S k), and that of a shift
+            # The transform of a Gaussian of covariance S is exp(-2 pi^2 k S k), and a shift is
             # a phase.
             (xx, xy), (_, yy) = 2 * np.pi**2 * to_pixels @ covariance @ to_pixels.T
             smoothed = np.exp(-(xx * kx**2 + yy * ky**2 + 2 * xy * kx * ky))
@@ -361,7 +361,7 @@ _BRIGHT = 50.0
 """Smallest S/N of such a source. The search of whole frames finds the fainter ones."""
 
 _SEEN = 10.0
-"""Smallest S/N of its light in all fitted pixels together: that of a source of 7e-5 at 3.4 arcsec
+"""Smallest S/N of its light in all fitted pixels together: a source of 7e-5 at 3.4 arcsec
 was a candidate of S/N 9 there."""
 
 _SAME = 0.2

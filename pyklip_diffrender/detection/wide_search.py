@@ -49,8 +49,8 @@ from pyklip_diffrender.scene.simulation import within_field
 class WideField:
     """Sources in whole frames.
 
-    About the star the maps are those of the `Detection`, with the star marginalised. Elsewhere
-    they are those of a matched filter on the frames without the star, extrapolated from its fit,
+    About the star the maps are taken from the `Detection`, with the star marginalised. Elsewhere
+    they come from a matched filter on the frames without the star, extrapolated from its fit,
     and without the background. Images have the first frame's pixels.
 
     Attributes
@@ -60,13 +60,13 @@ class WideField:
     threshold : float
         Smallest S/N of a candidate.
     contrast, error, snr : ndarray, (ny, nx)
-        As those of `Detection`; NaN where nothing is known.
+        As in `Detection`; NaN where nothing is known.
     grid : ndarray, (ny, nx, 2)
         x, y of the pixels from the star, arcsec.
     error_factor : ErrorFactor
         Factor by which errors outside the fitted pixels were multiplied.
     candidates : QTable
-        Candidates, highest S/N first, those of the detection included; columns as in
+        Candidates, highest S/N first, including the detection's; columns as in
         `Detection.candidates`, and fit_chi2, shape, fwhm_major, fwhm_minor and axis_angle. An
         extended source, or several that are blended, are one row with the contrast of all of its
         light.
@@ -148,7 +148,7 @@ class WideField:
         Parameters
         ----------
         ax : two Axes, optional
-            Default those of a new figure.
+            Axes to draw in; a new figure by default.
 
         Returns
         -------
@@ -200,7 +200,7 @@ class WideField:
         return written
 
 
-# Search of the whole frames, seamless with that of the pixels about the star.
+# Search of the whole frames, seamless with the search of the pixels about the star.
 
 _log = logging.getLogger(__name__)
 
@@ -218,8 +218,8 @@ _SADDLE = 0.5
 of two point sources, those less than about two lambda/D apart."""
 
 _POINT = 2.0
-"""Reduced chi-squared, over the squared error factor, up to which a source is not fitted with
-another shape than that of a point source."""
+"""Reduced chi-squared, over the squared error factor, up to which a source is fitted
+as a point source only."""
 
 _GAIN = 25.0
 """Decrease of chi-squared, over the squared error factor, by the shape of an extended source."""
@@ -307,11 +307,11 @@ def wide_field(
     Parameters
     ----------
     detection : Detection
-        Of one fit; its frames are cutouts of the observations.
+        Search of one fit, whose frames are cutouts of the observations.
     observations : sequence of Observation
         The target's frames before they were cut, in the order of the fit.
     threshold : float, optional
-        S/N of a candidate; default that of the detection.
+        Smallest S/N of a candidate; default: the detection's.
 
     Returns
     -------
@@ -320,7 +320,7 @@ def wide_field(
     Raises
     ------
     IncompatibleSetupError
-        For observations that are not those of the fit, or a detection of several fits.
+        For observations that were not fitted, or a detection of several fits.
 
     Examples
     --------
@@ -342,7 +342,7 @@ def wide_field(
         require_outer_pixels(observations[0], len(detection.grid))
     information, measured, factor, snr = _search(frames, outer, grid, threshold, detection)
     rows_of = _sources(frames, measured, snr, factor, detection)
-    # The star's displacement is that of a source at half the height of the fitted frame.
+    # The star's displacement is evaluated at half the height of the fitted frame.
     halfway = torch.tensor([0.0, float(np.abs(detection.grid[..., 1]).max()) / 2])
     found = [each.measurement for each in rows_of]
     sources = with_position_of_star(detection.groups, _candidates(found), halfway.double())
@@ -386,7 +386,7 @@ def wide_field(
 
 
 def require_outer_pixels(observation: Observation, size: int) -> None:
-    """Refuse a frame of which a search beyond the fitted square of side `size` leaves no pixel.
+    """Refuse a frame without pixels to search beyond the fitted square of side `size`.
 
     Raises `IncompatibleSetupError`.
     """
@@ -409,7 +409,7 @@ def _frames(detection: Detection, observations: Sequence[Observation]) -> list[W
     names = [each.observation.name for each in fitted]
     if [each.name for each in observations] != names:
         raise IncompatibleSetupError(
-            f"observations: got {[each.name for each in observations]}, expected those of the fit, "
+            f"observations: got {[each.name for each in observations]}, expected the fitted ones, "
             f"{names}, before they were cut"
         )
     known = detection.sources
@@ -554,9 +554,9 @@ def _sources(
     factor: ErrorFactor,
     detection: Detection,
 ) -> list[_Source]:
-    """The sources of which the point sources that were found are parts, each with its shape.
+    """Sources with their shapes, each joined from the point sources that are parts of it.
 
-    Those whose middle is not where the first frame is searched are left out.
+    Sources whose middle is not where the first frame is searched are left out.
     """
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
     labels = _blends(frames[0], parts, snr)
@@ -690,7 +690,7 @@ def _add_shapes(
 ) -> None:
     """Add chi-squared of the point source and the shape to a table of sources.
 
-    Those in the fitted pixels, None, are not judged.
+    Sources in the fitted pixels, None, are not judged.
     """
     shapes = [None if each is None else each.shape for each in sources]
     kinds = ["" if s is None else "extended" if s.shape else "point" for s in sources]

@@ -89,7 +89,7 @@ _BOX = (0.17, 0.13, 0.6, 0.77)
 
 
 def axes_for(ax: Any, count: int) -> Sequence[Axes]:
-    """Return the axes of the caller, or those of a new figure with one row.
+    """Return the axes of the caller, or of a new figure with one row.
 
     Raises `IncompatibleSetupError` for another number of axes than `count`.
     """

@@ -40,7 +40,7 @@ def star_image(
     """Draw the light of a star and its surroundings on the scale `norm`, see `light_norm`."""
     style: dict[str, Any] = {"cmap": _LIGHT, "norm": norm}
     if hasattr(norm, "linear_width"):
-        # Powers of ten in the logarithmic part; those of the linear part would overlap.
+        # Powers of ten in the logarithmic part only; in the linear part they would overlap.
         decades = np.arange(np.ceil(np.log10(norm.linear_width)), np.log10(norm.vmax))
         style["ticks"] = [0.0, *10.0**decades]
     _on_sky(ax, image, grid, north, bar=bar, title=title, **style)
@@ -171,7 +171,7 @@ def show_pixels(
         ax.set_ylim(up.min(), up.max())
     ax.set_facecolor("0.75")
     ax.set_title(title, color=INK, loc="left")
-    # An inset follows the image, whose box differs from that of the axes.
+    # An inset follows the image, whose box differs from the box of the axes.
     strip = ax.inset_axes((1.03, 0.0, 0.05, 1.0))
     low, high = np.array(artist.get_clim(), dtype=float)
     extend = ("neither", "max", "min", "both")[

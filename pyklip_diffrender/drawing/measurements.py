@@ -73,7 +73,7 @@ def stamp_panels(stamp: Stamp, unit: str) -> Figure:
 def corner(names: Sequence[str], values: Array, covariance: Array, labels: Sequence[str]) -> Figure:
     """Draw the Gaussian of a few measured values: marginal distributions, and ellipses of pairs.
 
-    `names` (n) are those of the axes, with units, `values` is (n,), `covariance` (n, n), and
+    `names` (n) label the axes, with units, `values` is (n,), `covariance` (n, n), and
     `labels` (n) are values with their errors, as titles. Ellipses have one and two standard
     deviations: 39 and 86 % of the probability.
     """

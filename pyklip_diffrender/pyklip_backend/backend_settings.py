@@ -55,7 +55,7 @@ class DiffrenderSettings:
         folder of maps, the one closest in time to the frames is taken; see `choose_map` for other
         rules. "flat" stands for a flat wavefront.
     model : optical model or mapping, optional
-        From `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
+        Model from `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
         from the wavelength in ``dataset.wvs`` to a model. Made for the filter if not given.
     filter : str, optional
         NIRCam filter, such as ``"F444W"``. Read from the dataset if possible.
@@ -74,17 +74,17 @@ class DiffrenderSettings:
     fit : GaussNewton, optional
         Settings of the fit; see `refine`.
     systematics : Systematics, PatternLibrary, path, "auto", "references" or "off", optional
-        Flat-field pattern. "auto", the default for real NIRCam frames, takes that of the
+        Flat-field pattern. "auto", the default for real NIRCam frames, takes the pattern of the
         package's library, and fits the reference frames only where it has none; "references" fits
         them in any case and uses both; a library, its file, or a folder of such files is searched
-        besides the package's; see `reduce`. Reference frames are those of a psf_library that
+        besides the package's; see `reduce`. Reference frames come from a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.
     keep_detected : bool, optional
         Subtract none of the light of detected companions with the star; True by default for real
         NIRCam frames, else False. Bright ones are part of the fit in any case, as in `reduce`.
         Undetected companions still lose light, as much as the throughput map says.
     image : {"cleaned", "subtracted"}, optional
-        Image that the products carry. "subtracted", always that of forward models and the default
+        Image that the products carry. "subtracted", the only one for forward models and the default
         but for real NIRCam frames, is each frame minus its star. "cleaned", the default for real
         NIRCam frames, is the posterior mean of the sky from all rolls together, see
         ``imaging.SkyModel``: sources are as sharp as in the frames but have no side lobes, which
@@ -95,7 +95,7 @@ class DiffrenderSettings:
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.
     injected_into : pyklip.instruments.Instrument.Data, optional
-        A dataset that has been reduced. Those of the calls are copies of it to which faint sources
+        A dataset that has been reduced. The calls reduce copies of it to which faint sources
         were added; the star is not fitted to them again, but what it takes of the sources follows
         from the linear model of the fit. For contrast curves by injection.
     threads : int, optional
@@ -199,7 +199,7 @@ class DiffrenderSettings:
         return {name: value for name, value in values.items() if value is not None}
 
     def over(self, other: DiffrenderSettings) -> DiffrenderSettings:
-        """Complete the settings by those of `other`."""
+        """Complete the settings from `other`."""
         merged: dict[str, Any] = {}
         for name in (field.name for field in dataclasses.fields(self)):
             own = getattr(self, name)

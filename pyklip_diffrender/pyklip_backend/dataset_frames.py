@@ -1,7 +1,7 @@
 """The frames of one wavelength of a pyKLIP dataset that a fit gets, by pointing.
 
 Their files are judged as `Sequence` judges files. The fit gets the pixels that the files recorded,
-or those of ``dataset.input``.
+or the pixels of ``dataset.input``.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
 
 
 def admit(source: SourceFrames, frames: NDArray[np.intp], library: abc.Sequence[Path]) -> Admitted:
-    """Judge the files of `frames`, indices in `source`, of one filter, and those of the library.
+    """Judge the files of `frames`, indices in `source`, of one filter, and of the library.
 
     The target is the star of the first frame that is not marked as a reference (IS_PSF). Raises as
     `pyklip_diffrender.Sequence.from_files`, and warns of every file that is not used, or not
@@ -120,7 +120,7 @@ def _sequence(
     paths: abc.Sequence[Path],
     library: abc.Sequence[Path],
 ) -> Sequence:
-    """Sort the files of frames, and those of the library, none of which is opened twice."""
+    """Sort the files of frames and of the library, opening none twice."""
     headers = [source.headers[k] for k in frames]
     first = next((k for k, h in enumerate(headers) if not is_reference(h)), 0)
     name = source.filenames[frames[first]]
@@ -245,7 +245,7 @@ def frames_of(
 ) -> Frames:
     """Gather the target's frames of one wavelength with their errors, masks and metadata.
 
-    `imgs` (n, ny, nx) are those at `index` of ``dataset.input``, before any high-pass filter. Those
+    `imgs` (n, ny, nx) are frames `index` of ``dataset.input``, before any high-pass filter. Frames
     that `admit` excludes stay NaN in the products. Raises NoValidPixelsError if no frame has a
     valid pixel.
     """
@@ -321,7 +321,7 @@ def _gather(
             stacklevel=2,
         )
     if settings.error is not None:
-        # Frames have the unit of the files by now, and given errors that of the dataset.
+        # Frames have the unit of the files by now, and given errors the dataset's.
         error = _broadcast(settings.error, index, dataset.input.shape) / factor[:, None, None]
         noise = "given"
     elif error is None:

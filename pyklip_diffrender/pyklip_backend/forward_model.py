@@ -47,7 +47,7 @@ class PlanetInFrame:
     taken: float
     # (2,), x, y of the planet in pixels from the star.
     offset: NDArray[np.float64]
-    # Light of the planet over that of the star.
+    # Light of the planet over the star's.
     contrast: float
 
 
@@ -149,7 +149,7 @@ class _PlanetImage:
     offset: NDArray[np.float64]
     # (ny, nx), the planet in the frames, as bright as the star; NaN where there is no model.
     image: NDArray[np.float64]
-    # Light of the user's PSF over that of `image`.
+    # Light of the user's PSF over the light of `image`.
     scale: float
 
     @classmethod
@@ -241,7 +241,7 @@ def _is_companion(result: Refinement, part: FittedPointing, source: _PlanetImage
 #
 # A fit of the product, such as `pyklip.fitpsf.FMAstrometry`, has to estimate the noise from an
 # annulus about the star. The linear model knows the noise of every pixel and the self-subtraction,
-# so that its values are more precise and its errors are those of the values.
+# so that its values are more precise and its errors belong to the values.
 
 _log = logging.getLogger(__name__)
 

@@ -406,7 +406,7 @@ class DatasetReduction:
 
     @property
     def _before_injection(self) -> Sequence[ReductionRecord]:
-        """How the dataset was reduced of which this one is a copy with faint sources."""
+        """Records of the dataset that this one copies, before faint sources were added."""
         return getattr(self.settings.injected_into, RESULTS, ())
 
     @property
@@ -507,7 +507,7 @@ class DatasetReduction:
     def _write_extras(self, stage: Path, prefix: str, cards: fits.Header) -> None:
         """Write what pyKLIP does not: the throughput map, with its median in all products.
 
-        Fits without a linear model have none, and copies with added sources that of the original.
+        Fits without a linear model have no map, and copies with added sources have the original's.
         """
         if self._before_injection:
             return
@@ -587,7 +587,7 @@ class DatasetReduction:
         record = ReductionRecord(frames, opd, subtraction, filled, image)
         if image != "subtracted":
             self._tell(f"image of the products: {image}")
-            # The model of the sky is that of the fit, also for copies with added sources.
+            # The model of the sky is the fit's, also for copies with added sources.
             original = before[len(self.records)] if before else record
             added = frames.data - original.frames.data if before else None
             original.images.put_into(residuals, added)
@@ -629,7 +629,7 @@ class ForwardReduction(DatasetReduction):
         super()._check()
 
     def _image(self, subtraction: Subtraction) -> str:
-        """Return "subtracted": the forward model is that of a planet in the frames minus star."""
+        """Return "subtracted": the forward model is for a planet in the frames minus star."""
         return "subtracted"
 
     @property

@@ -116,8 +116,8 @@ class ProductImages:
     def put_into(self, residuals: Image, added: Image | None = None) -> None:
         """Replace the fitted square of frames minus star (n, Ny, Nx) by the image of the sky.
 
-        It is done in place. `added` is the light, (n, Ny, Nx), in copies of the frames that those
-        of the fit do not have.
+        It is done in place. `added` is the light, (n, Ny, Nx), that copies of the frames have
+        and the fitted frames do not.
         """
         sky = self._cleaned(added)
         for part in self.pointings:
@@ -258,7 +258,7 @@ def on_product(
     """Turn a map (ny, nx) of the first frame the way pyKLIP turns frames; NaN beyond its edges.
 
     The star is at x, y = `center` there, and at `product_center` of the product. pyKLIP turns by
-    `angle`, in degrees counter-clockwise; `flipx` is that of `pyklip.klip.rotate`.
+    `angle`, in degrees counter-clockwise; `flipx` is as in `pyklip.klip.rotate`.
     """
     y, x = np.indices(shape)
     # The pixel of the product at x, y from the star, turned back clockwise:
@@ -291,8 +291,8 @@ def write_throughput(
         shape = dataset.output.shape[-2:]
         each = on_product(image, frame.center[0], shape, center, angle, dataset.flipx)
         # Three kinds of pixels: NaN outside the fitted square, where nothing is taken and the
-        # throughput is 1; inf, so NaN in the file, where the product has no value; and those of the
-        # median.
+        # throughput is 1; inf, so NaN in the file, where the product has no value; and the
+        # pixels of the median.
         each[np.isnan(dataset.output[0, :, k]).all(axis=0)] = np.inf
         turned.append(each)
     cube = np.array(turned)
@@ -473,7 +473,7 @@ def _fitted(subtraction: Subtraction) -> Iterator[str]:
 def stamp(folder: Path, cards: fits.Header, unit: str) -> None:
     """Add cards to the primary header of every FITS file in a folder; pixels stay as they are.
 
-    `unit` is that of files without BUNIT; empty if it is not known. The cards of KLIP's parameters
+    `unit` stands for a missing BUNIT; empty if it is not known. The cards of KLIP's parameters
     stay, because programs read them, with a comment that says what they mean here.
     """
     for path in (p for p in folder.rglob("*") if ".fits" in p.suffixes):

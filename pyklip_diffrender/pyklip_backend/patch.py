@@ -16,9 +16,9 @@ logger = logging.getLogger(__name__)
 class PatchedFunction:
     """A function that keeps its identity but runs other code between `apply` and `restore`.
 
-    The code is that of `trampoline`, which runs with the globals of the patched function, so has to
-    import what it uses. Raises IncompatibleSetupError if `function` does not look up `uses` in its
-    module.
+    The code is taken from `trampoline`, which runs with the globals of the patched function, so has
+    to import what it uses. Raises IncompatibleSetupError if `function` does not look up `uses` in
+    its module.
     """
 
     def __init__(

@@ -309,7 +309,7 @@ def backend(
     name : str
         Only "diffrender".
     opd, model, **options
-        As for `register`; they override those of the dataset and of `register`.
+        As for `register`; they take precedence over the dataset's and `register`'s.
     force : bool
         Also take over calls with ``algo="klip"``, for code that hard-codes it. Other algorithms
         are not affected.

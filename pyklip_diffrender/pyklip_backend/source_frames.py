@@ -145,7 +145,7 @@ def why_without_source(dataset: Any) -> str | None:
 def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
     """Read the pixels, errors, flags and headers of the files of a `JWSTData`.
 
-    Raises ValueError if shifting the first frame as pyKLIP does not give that of ``dataset.input``.
+    Raises ValueError if the first frame, shifted as by pyKLIP, is not in ``dataset.input``.
     """
     from pyklip.klip import align_and_scale
 
@@ -184,7 +184,7 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
 
 
 def _joined(stacks: abc.Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Frames of all files, (N, ny, nx), without a copy of those of a single file."""
+    """Frames of all files, (N, ny, nx), without a copy if there is a single file."""
     return stacks[0] if len(stacks) == 1 else np.concatenate(stacks)
 
 
@@ -316,7 +316,7 @@ def _read(path: str, dataset: Any) -> tuple[_File, NDArray[np.floating[Any]], ND
         center += offset / np.sqrt(science["PIXAR_A2"])
     centers = np.tile(center, (len(as_read), 1))
     if isinstance(frames, CorruptFileError | NoValidPixelsError):
-        # Such as a file without errors, or a frame of which all pixels are flagged.
+        # Such as a file without errors, or a frame whose pixels are all flagged.
         _log.warning("only the pixels and flags are used: %s", frames)
         return _File(file, header, as_read, None, usable, centers, None, None), as_read, center
     if not isinstance(frames, Observation):
@@ -366,7 +366,7 @@ _SINGLE_PRECISION = 1e-5
 
 
 class NotRecordedError(Exception):
-    """The recorded pixels are not those of the dataset, for the reason that the message gives."""
+    """Raised where the recorded pixels are not the dataset's; the message gives the reason."""
 
 
 class Recorded(NamedTuple):
@@ -390,7 +390,7 @@ def recorded_frames(
 
     Frame by frame, so that the changes of all frames are not in memory at once. `index` and
     `places` (n,) say where the frames are in the dataset and, of all its frames, in `source`.
-    Raises NotRecordedError if no recorded pixels correspond to those of the dataset.
+    Raises NotRecordedError if no recorded pixels correspond to the dataset's.
     """
     from pyklip.klip import align_and_scale
 
@@ -522,7 +522,7 @@ def pointings_of(
 ) -> list[Pointing]:
     """Sort the frames of an observation by file and by place of the star, in order of time.
 
-    The rule is that of `Observation.pointings`. Without `details`, one for each frame, all frames
+    The rule is `Observation.pointings`'s. Without `details`, one for each frame, all frames
     are as if from one file.
     """
     known = observation.position_angles

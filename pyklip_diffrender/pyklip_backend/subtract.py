@@ -144,7 +144,7 @@ def _give_back(
 def _options(
     settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
 ) -> ReduceOptions:
-    """Options of the reduction; the settings that are None are those of `reduce`."""
+    """Options of the reduction; settings that are None have the defaults of `reduce`."""
     from pyklip_diffrender.reduction.fit_status import MAX_CHI2
 
     own = {

@@ -54,7 +54,7 @@ _TRIALS = 4
 """Position angles at which planets are injected at every separation."""
 
 _GOLDEN = 137.5
-"""Degrees from the planets at one separation to those at the next."""
+"""Degrees from the planets at one separation to the planets at the next."""
 
 _TURN = 1.0
 """Degrees between rolls that are references of each other."""
@@ -154,7 +154,7 @@ def klip_curve(
     )
     # limit = 5 noise / response, with the noise in a ring of width lambda/D, where the detection
     # has limits, and the response to an injected planet of contrast 1. At every separation the
-    # number of modes is that with the best limit.
+    # number of modes is the one with the best limit.
     # So faint that the modes hardly change.
     contrasts = _SIGMAS * noise.min(axis=0) / klip.norm
     response, alone = np.zeros_like(noise), np.zeros(len(separations))
@@ -264,7 +264,7 @@ class KlipSubtraction:
         star = torch.zeros(1, 2, dtype=torch.float64)
         places = np.array([templates.pixels_of(k, star)[::-1, 0] for k in frames])
         recorded = np.array([each.observation.center.mean(axis=0) for each in frames.values()])
-        # The fit knows by how much the recorded positions are off; those of the references, which
+        # The fit knows by how much the recorded positions are off; the references, whose positions
         # were recorded in the same way, are taken to be off by as much.
         others = [
             each.center.mean(axis=0) + (places - recorded).mean(axis=0) for each in references
@@ -310,7 +310,7 @@ class KlipSubtraction:
         side = 2 * _HALF + 1
         kernel = np.pad(image, _HALF)[row : row + side, column : column + side]
         self.norm = float(np.sqrt((kernel**2).sum()))
-        """Of a planet of contrast 1 in a smoothed image of which nothing was subtracted."""
+        """Peak of a planet of contrast 1 in a smoothed image before any subtraction."""
         self._kernel = kernel[::-1, ::-1] / self.norm
 
     @property

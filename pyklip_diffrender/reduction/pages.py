@@ -57,8 +57,8 @@ def sentence(summary: Mapping[str, Any]) -> str:
         parts.append(_outside(summary))
     if summary["accuracy"] == "quick":
         parts.append(
-            "This is a first look with a coarser model, whose limits are not those of a full "
-            "reduction."
+            "This is a first look with a coarser model, whose limits differ from the limits "
+            "of a full reduction."
         )
     return " ".join(parts)
 
@@ -168,7 +168,7 @@ def _places(error: float) -> int:
 def depth_against_klip(curve: Mapping[str, Any], klip: Mapping[str, Any] | None) -> str:
     """Say in a sentence whose limits are deeper at which separations, and by how much.
 
-    The curves are those of a summary (separation_arcsec, contrast, small_sample), and are compared
+    The curves are from a summary (separation_arcsec, contrast, small_sample), and are compared
     at KLIP's separations. Empty without KLIP, or if the curves have no separation in common.
     """
     if klip is None:

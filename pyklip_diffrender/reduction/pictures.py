@@ -222,7 +222,7 @@ class Overview:
     def kept(self, separations: Sequence[float]) -> tuple[Image, Image | None]:
         """Fractions of a faint source's light that the image and KLIP leave at separations.
 
-        Medians of rings a resolution element wide; KLIP's are those of its best numbers of modes.
+        Medians of rings a resolution element wide; KLIP's are for its best numbers of modes.
         """
         resolution = self._detection.contrast_curve.meta["resolution_arcsec"]
         distance = np.hypot(*np.moveaxis(self.images.grid, -1, 0))
@@ -253,7 +253,7 @@ class Overview:
 Pictures = Sequence[Picture]
 
 MOST_FRAMES = 4
-"""Frames of which pictures are shown, and candidates."""
+"""Largest number of frames, and of candidates, with pictures."""
 
 _STAMP = 0.45
 """Half of the side of the pictures of a candidate, arcsec."""
@@ -261,7 +261,7 @@ _STAMP = 0.45
 
 @dataclass(frozen=True)
 class ReportPictures:
-    """The pictures of a report, by section; those that a reduction does not have are missing."""
+    """The pictures of a report, by section; pictures that a reduction does not have are missing."""
 
     overview: Pictures = ()
     curve: Pictures = ()
@@ -356,7 +356,7 @@ def _kept(
 def _curve(
     reduction: ReductionResult, summary: Mapping[str, Any], klip: QTable | None
 ) -> list[Picture]:
-    """The contrast curve, with that of KLIP if it is known."""
+    """The contrast curve, with KLIP's if it is known."""
     detection = reduction.detection
     sigmas = summary["contrast_curve"]["sigmas"]
     dotted = (
@@ -369,7 +369,7 @@ def _curve(
         if klip is None
         else f" Squares: {klip.meta['label']} on the same frames, in units of the same star, with "
         "the best number of modes at every separation; its noise is the scatter in a ring without "
-        "the candidates, its throughput that of injected planets."
+        "the candidates, its throughput is measured with injected planets."
     )
     figure, ax = drawing.wide_panel()
     draw_curve(ax, detection, klip, legend_below=True)
@@ -411,7 +411,7 @@ def _candidate(detection: Detection, place: int) -> list[Picture]:
         figure,
         f"Contrast and position of candidate {number} by the covariance of the fit, with the star "
         "and the other candidates marginalised. Ellipses have one and two standard deviations, 39 "
-        "and 86 % of the probability. Errors include those of the star's flux and position.",
+        "and 86 % of the probability. Errors include the star's flux and position.",
     )
     return [*pictures, corner]
 
@@ -470,7 +470,7 @@ def _measured(
 ) -> tuple[tuple[str, str], NDArray[np.float64], NDArray[np.float64]]:
     """Contrast and offset (3,) of a candidate, arcsec, with their names and covariance (3, 3).
 
-    The offset is that to the east and north where the orientation is known, else x and y.
+    The offset is to the east and north where the orientation is known, else x and y.
     """
     row = detection.candidates[place]
     is_known = "delta_ra" in row.colnames
@@ -490,7 +490,7 @@ def _scaled(detection: Detection) -> str:
     """How errors were scaled, in a sentence."""
     factors = detection.error_factor.factors
     if not detection.error_factor.is_needed:
-        return "Errors are those of the fit, not scaled."
+        return "Errors are as in the fit, not scaled."
     if not detection.error_factor.is_measured:
         return (
             f"Errors were multiplied by {factors[0, 0]:.2f}, the square root of the reduced "
@@ -516,7 +516,7 @@ def _wide(wide: WideField) -> list[Picture]:
         "whole_frames_snr": (
             f"S/N of a point source in the whole frames, {some}, {up}: {nx} × {ny} pixels, at most "
             "the field of the mask, 20 arcsec wide. Circles have the numbers of the table. About "
-            "the star it is that of the search above; elsewhere the star, extrapolated from its "
+            "the star it is the S/N of the search above; elsewhere the star, extrapolated from its "
             "fit, and the background were subtracted. Errors follow the scatter of the S/N at "
             "every separation."
         ),

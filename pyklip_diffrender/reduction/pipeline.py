@@ -159,7 +159,7 @@ class ReductionResult:
 
     @property
     def search(self) -> Detection | WideField:
-        """The search of the whole frames, if it was asked for, else that of the fitted pixels."""
+        """The search of the whole frames, if it was asked for, else of the fitted pixels."""
         return self.detection if self.wide is None else self.wide
 
     @property
@@ -202,7 +202,7 @@ def prepare(
 ) -> Preparation:
     """Check that a sequence can be reduced, and make what the reduction starts from.
 
-    The model is by default that of the frames' filter and mask, with `size` pixels a side, which
+    The default model has the frames' filter and mask, and `size` pixels a side, which
     must be inside the frames. With a model, as many pixels as its detector has are fitted; those
     beyond the edges of the frames are masked. Raises as `reduce`.
     """
@@ -214,7 +214,7 @@ def prepare(
         _log.warning("%s", remark)
 
     def map_for(date: Time | None) -> OPDMap:
-        """Of a folder of maps, the one nearest to a date."""
+        """Map nearest to a date, if there is a folder of maps."""
         return wavefront_for(opd, date) if is_folder and date is not None else wavefront
 
     if options.star_flux is not None:
@@ -261,7 +261,7 @@ def prepare(
 
 
 def _within_field(sequence: Sequence) -> Sequence:
-    """The frames without the pixels beyond the field of their mask, as those of a subarray are."""
+    """The frames without the pixels beyond the field of their mask, as in a subarray."""
     largest = sequence.science[0].shape
     science, references = (
         tuple(map(within_field, frames)) for frames in (sequence.science, sequence.references)
@@ -301,9 +301,9 @@ class Preparation:
     # To start from.
     wavefront: OPDMap
     options: ReduceOptions
-    # Of the fits; None for those of `refine`.
+    # Fit settings; None: the defaults of `refine`.
     settings: GaussNewton | None = None
-    # The wavefront to start from at another date; None for the same at all.
+    # The wavefront to start from at another date; None for the same at all dates.
     map_for: Callable[[Time | None], OPDMap] | None = None
 
     def run(self, *, progress: bool = False, products: Keeper | None = None) -> ReductionResult:
@@ -512,7 +512,7 @@ class _Run:
         return frames_for_pattern(self.preparation.sequence, self.preparation.options)
 
     def _joins_early(self, choice: PatternChoice) -> bool:
-        """Whether the fit of the target alone is only the beginning of that of all frames."""
+        """Whether the fit of the target alone is only the beginning of the fit of all frames."""
         # Where the pattern is known, the target alone may have the deeper limits, so it is fitted
         # to the end and both fits are searched.
         return bool(self._joining) and not is_known_beside(choice, self._joining)

@@ -33,12 +33,12 @@ from pyklip_diffrender.scene.sequence import by_reason
 # The report: what its page shows of a summary, and its pictures.
 
 _PHOTOMETRY = (
-    "Flux densities and magnitudes (AB; Vega by CALSPEC's alpha_lyr_stis_011) are those of the "
+    "Flux densities and magnitudes (AB; Vega by CALSPEC's alpha_lyr_stis_011) are for the "
     "source without coronagraph: the "
-    "transmission of mask and Lyot stop is accounted for. Their errors do not include that of the "
+    "transmission of mask and Lyot stop is accounted for. Their errors do not include the "
     "pipeline's photometric calibration behind the coronagraph, about 30 % (0.3 mag)."
 )
-"""Whatever stands beside a flux density."""
+"""Note beside every flux density."""
 
 
 def page(
@@ -182,7 +182,7 @@ def _provenance(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _flat(settings: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, str]]:
-    """Names and values of settings; those of settings in settings have both names."""
+    """Names and values of settings; settings in settings have both names."""
     for name, value in settings.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{within}{name}.")
@@ -234,7 +234,7 @@ PRODUCTS = {
 
 
 _FIGURES = "figures"
-"""Folder of the figures, in that of the products."""
+"""Folder of the figures, in the folder of the products."""
 
 _FIGURE = re.compile(
     r"(without_star|klip|most_probable|snr|contrast_curve|candidate_\d+_(frame_\d+|corner)"

@@ -102,7 +102,7 @@ class Reduction(ReductionResult):
         Parameters
         ----------
         ax : two Axes, optional
-            Default those of a new figure.
+            Axes to draw in; a new figure by default.
 
         Returns
         -------
@@ -159,7 +159,7 @@ class Reduction(ReductionResult):
         if unread:
             warnings.warn(
                 f"{folder}: {' and '.join(unread)} "
-                f"{'is' if len(unread) == 1 else 'are'} not read: the reduction is that of the "
+                f"{'is' if len(unread) == 1 else 'are'} not read: the reduction has only the "
                 "pixels in which the star was fitted",
                 DiffrenderWarning,
                 stacklevel=2,
@@ -270,11 +270,11 @@ def reduce(
     options : ReduceOptions, optional
         Options of the reduction, in place of `keywords`.
     output : path, optional
-        Folder for the products, as those of `Reduction.write`. They are written as they come: those
+        Folder for the products, as of `Reduction.write`. They are written as they come: products
         of the fit and the search before wide, disk, injections and completeness begin.
     overwrite : bool
         Replace the products of an earlier reduction in `output`. Products that somebody else writes
-        there while this reduction runs are kept in any case: those of this one then go to a new
+        there while this reduction runs are kept in any case: this reduction's then go to a new
         folder in `output`.
     **keywords
         Options by name, such as ``size=120``: the fields of `ReduceOptions`.

@@ -30,7 +30,7 @@ COMPARISON = ("comparison.html", "comparison.json")
 """Files that `write_comparison` writes."""
 
 _MOST_TRACKS = 6
-"""Candidates of which the way of a background source is drawn."""
+"""Largest number of candidates for which the track of a background source is drawn."""
 
 
 def write_comparison(

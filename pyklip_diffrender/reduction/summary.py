@@ -96,7 +96,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
         "frames": [
             *(
                 _frame(each, "target") | {"bad_pixels": _bad_pixels(each, fitted)}
-                # Frames of reference stars follow those of the target.
+                # Frames of reference stars follow the target's.
                 for each, fitted in zip(sequence.science, fit.frames, strict=False)
             ),
             *(_frame(each, uses.get(each.name, "not used")) for each in sequence.references),
@@ -127,7 +127,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
 def wavefronts(fit: Refinement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The wavefront before and after the fit, nm, without piston; NaN outside the pupil.
 
-    After the fit it is that of the first frame.
+    The wavefront after the fit is the first frame's.
     """
     lit = fit.model.entrance.lit.cpu().numpy()
     before = resample(fit.initial.data, len(fit.wavefront))
@@ -185,7 +185,7 @@ def _star(detection: Detection) -> dict[str, Any] | None:
 
 
 def _candidates(reduction: ReductionResult) -> list[dict[str, Any]]:
-    """Candidates; those that look like extended light have no false-alarm probability."""
+    """Candidates; the ones that look like extended light have no false-alarm probability."""
     rows = plain_rows(reduction.detection.candidates)
     if reduction.extended:
         rows = [each | {"false_alarm_probability": None} for each in rows]

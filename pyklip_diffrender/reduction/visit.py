@@ -1,4 +1,4 @@
-"""The frames of reference stars in one likelihood with those of the target.
+"""Frames of reference stars in one likelihood with the target's frames.
 
 The target is fitted first. The frames of reference stars of the same visit are then aligned with
 its wavefront, and a few steps fit all frames together: with one wavefront, but for a drift from
@@ -11,7 +11,7 @@ detector. What speaks against a frame is looked at in this order:
 2. A companion of a reference star that the joint fit shows is treated in the same way.
 3. Frames of a reference star that the joint fit does not explain as well as it does the target's
    are left out.
-4. The limits of all frames together are compared with those of the target's frames alone, which
+4. Limits of all frames together are compared with limits of the target's frames alone, which
    may have the library's pattern. At every separation the deeper ones are used (`deeper`); where
    the target alone was fitted roughly, one of the two fits is kept as a whole.
 """
@@ -67,7 +67,7 @@ _CYCLES = 8.0
 one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show it, from a fourth
 of that up to 11 nm. The heaters of the instruments' electronics alone change it by 1 to 2 nm within
 minutes (R. Telfer et al. 2024, SPIE 13092), and it drifts by 9 nm within days (Feng et al. 2025,
-section 4). Finer modes than those up to 8 cycles per pupil are those of the polished segments,
+section 4). Modes finer than 8 cycles per pupil belong to the polished segments,
 which last; with 12 cycles, limits of a simulated visit are the same within 1 %, and take a quarter
 longer."""
 
@@ -75,11 +75,11 @@ _TOLERANCE = 3e-4
 """`GaussNewton.tolerance` of the joint fit: 13 units of chi-squared for seven frames."""
 
 _ROUGH = 1e-3
-"""`GaussNewton.tolerance` of the fit of the target alone that precedes it."""
+"""`GaussNewton.tolerance` of the fit of the target alone, before the joint fit."""
 
 _EXCESS = 1.5
-"""Chi-squared per pixel of a reference frame over that of the target's frames, from which it
-contradicts them."""
+"""Chi-squared per pixel of a reference frame over the target's, from which the frame contradicts
+the target."""
 
 _UNLIKE = 0.14
 """Part of a star's light that the target's wavefront leaves unexplained, at 4.4 um, from which a
@@ -92,14 +92,14 @@ _STEPS = 20
 
 _FAINT = 0.05
 """Flux of a reference star over the target's below which its frames teach nothing: their noise is
-20 times that of the target, relative to the star."""
+20 times the target's, relative to the star."""
 
 _MASKED = 1.5
 """Radius of the mask about a companion of a reference star, lambda/D: its core. Its side lobes are
 subtracted with the contrast that the joint fit without it leaves, three quarters or more."""
 
 _SUBTRACTED = 0.1
-"""Error of the light that is subtracted: that of a star which the wavefront of another one explains
+"""Error of the light that is subtracted: a star that the wavefront of another one explains
 is 0.05 to 0.13 off, see `_UNLIKE`."""
 
 _ROUNDS = 4
@@ -113,7 +113,7 @@ _ANGLES = 6
 
 _SHOWN = 12.0
 """S/N of a candidate in the target's frames alone above which all candidates are companions of the
-joint fit. Those of more than 25 in all frames would have it refined again, for half of its time,
+joint fit. Candidates above 25 in all frames would have it refined again, for half of its time,
 and the references make the S/N up to twice as large."""
 
 _FRAME = 2.2
@@ -134,9 +134,9 @@ class Contribution:
     reason: str = ""
     # Per pixel in the joint fit; like the following NaN without one.
     chi2: float = math.nan
-    # Of its star, over the target's.
+    # Flux of its star over the target's.
     flux: float = math.nan
-    # Rms of the difference of its wavefront from that of the target's first frame, nm.
+    # Rms of its wavefront minus the wavefront of the target's first frame, nm.
     drift: float = math.nan
 
 
@@ -146,9 +146,9 @@ class Visit:
 
     # One for each frame of a reference star.
     contributions: tuple[Contribution, ...] = ()
-    # Limits of the target's frames alone over those of the fit of all frames, in units of flux: the
-    # median over the separations from 0.4 to 2 arcsec at which the latter is used. NaN if it is
-    # used nowhere.
+    # Limits of the target's frames alone over the limits of all frames, in units of flux: the
+    # median over the separations from 0.4 to 2 arcsec at which all frames are used. NaN if they
+    # are used nowhere.
     gain: float = math.nan
     # These separations in words, such as "at 0.2 to 0.5 arcsec"; empty for all.
     where: str = ""
@@ -158,7 +158,7 @@ class Visit:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any]) -> Visit:
-        """Of the entry of ``summary.json``, in which None stands for NaN."""
+        """Make it from the entry of ``summary.json``, in which None stands for NaN."""
 
         def known(entries: Mapping[str, Any]) -> dict[str, Any]:
             return {key: math.nan if value is None else value for key, value in entries.items()}
@@ -227,9 +227,9 @@ def with_references(
     memory: float | None = None,
     progress: bool = False,
 ) -> Joined:
-    """Fit the frames of reference stars, cut like the target's, together with those of the target.
+    """Fit the target's frames together with frames of reference stars that are cut like them.
 
-    `choice` has the pattern of `fit`, that of the target alone. Limits are compared as `search`
+    `choice` has the pattern of `fit`, the target's own fit. Limits are compared as `search`
     states them, with errors scaled to the scatter of the S/N, else as the linear models predict
     them. Frames that do not fit into `memory`, bytes of the process, are left out.
     """
@@ -530,7 +530,7 @@ def _with_companions_masked(
 
 
 def _gain(alone: Refinement, joint: Refinement) -> float:
-    """Limits of one fit over those of another, in units of flux, the median over separations."""
+    """Median over separations of the limits of one fit over another's, in units of flux."""
     return float(np.nanmedian(_flux_errors(alone) / _flux_errors(joint)))
 
 
@@ -550,14 +550,14 @@ def _flux_errors(fit: Refinement) -> NDArray[np.float64]:
 def _stated_gains(
     alone: Detection, joint: Detection
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Separations, arcsec, and stated limits of one search over those of another, by flux."""
+    """Separations, arcsec, and stated limits of one search over another's, by flux."""
     separations, limits = stated_limits(alone)
     gains = limits / np.interp(separations, *stated_limits(joint))
     return separations, gains
 
 
 def _drifts(joint: Refinement) -> NDArray[np.float64]:
-    """Rms of the difference of every frame's wavefront from that of the first one, nm."""
+    """Rms of the difference of every frame's wavefront from the first frame's, nm."""
     coefficients = []
     linear = joint.linear
     for frame in linear.frames:

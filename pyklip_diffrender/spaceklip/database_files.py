@@ -127,7 +127,7 @@ def complete_header(product: Path, table: Table, mode: str) -> None:
 def write_rolls(product: Path, dataset: Any, files: Iterable[str | os.PathLike[str]]) -> None:
     """Write the median of the subtracted frames of every file beside the product of all.
 
-    The header is that of the product. All frames of one of the `files`, of the target, have the
+    The header is the product's. All frames of one of the `files`, of the target, have the
     same roll.
     """
     header = fits.getheader(product)

@@ -104,7 +104,7 @@ class Config:
     workers : int or None
         Processes; None for one per core, 0 for this process alone.
     memory_limit : float or None
-        Of each worker, bytes; None for an equal share of the machine's.
+        Memory of each worker, bytes; None for an equal share of the machine's.
     spectra : tuple of str
         Spectra of planets for the search over the filters of a star, see `combine`; empty for its
         defaults.
@@ -230,7 +230,7 @@ class _Reader:
     def sequence(
         self, content: Any, place: str, options: Options, planets: Injections
     ) -> SequenceConfig | None:
-        """A sequence, whose own options and planets come before those of all; None without one."""
+        """A sequence, whose own options and planets override the survey's; None without one."""
         given = self.values(content, place, {
             "files": (
                 "FITS files, folders of them, patterns such as frames/*_calints.fits or "
@@ -277,10 +277,10 @@ class _Reader:
         }
 
     def options(self, given: dict[str, Any], default: Options, place: str) -> Options:
-        """Options of a table, whose values they are taken from."""
+        """Options of a table, taken out of its values."""
         own = {each.name: given.pop(each.name) for each in fields(Options) if each.name in given}
         if "settings" in own:
-            # Those of a sequence come on top of the survey's.
+            # Settings of a sequence come on top of the survey's.
             settings = {**default.settings, **own.pop("settings")}
             wrong = _wrong_settings(settings)
             self.problems += [f"{place}: settings: {each}" for each in wrong]
@@ -404,7 +404,7 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
     except DiffrenderError as error:
         return [str(error)]
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        return [f"got a value of the wrong type ({error}), expected those of GaussNewton"]
+        return [f"got a value of the wrong type ({error}), expected the types of GaussNewton"]
     return []
 
 

@@ -83,7 +83,7 @@ def _sequence(job: Job) -> Sequence:
 
 
 def _options(job: Job, frames: Observation, **changes: Any) -> ReduceOptions:
-    """Options of a job's reduction; settings that it does not name are those of the preset."""
+    """Options of a job's reduction; settings that it does not name have the preset's values."""
     own = job.options.settings
     changes["settings"] = nircam_settings(frames, **own) if own else None
     return ReduceOptions(**{**vars(job.options), **changes})
@@ -178,7 +178,7 @@ def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) ->
 
 
 def _require_same_world(job: Job, jobs: Path) -> None:
-    """Refuse to work where version, folders or files are not those of the plan."""
+    """Refuse to work where version, folders or files differ from the plan."""
     host = socket.gethostname()
     if job.version != __version__:
         raise IncompatibleSetupError(
@@ -198,7 +198,7 @@ def _require_same_world(job: Job, jobs: Path) -> None:
             )
         if sha256(name) != digest:
             raise CorruptFileError(
-                f"{name}: the content on {host} is not that of the plan. Start the survey again if "
+                f"{name}: the content on {host} differs from the plan. Start the survey again if "
                 "the file was changed"
             )
 

@@ -45,7 +45,7 @@ class Job:
 
     # Hash of the package's version, the content of the input files, and the options.
     key: str
-    # Of the sequence, by default target and filter, with the date of the epoch if it has several.
+    # Name of the sequence, by default target and filter, with the date of an epoch among several.
     name: str
     # Frames.
     files: tuple[str, ...]
@@ -61,7 +61,7 @@ class Job:
     injection: Injection | None = None
     # Key of the job whose fit an injection starts from.
     base: str | None = None
-    # Of the package.
+    # Version of the package.
     version: str = __version__
 
     @property
@@ -218,7 +218,7 @@ def hash_of(facts: Mapping[str, Any]) -> str:
 
 
 def _files(paths: tuple[Path, ...]) -> list[Path]:
-    """The files themselves, and those of folders."""
+    """Paths of the files, and of the files in folders."""
     files: list[Path] = []
     for path in paths:
         inside = fits_files(path) if path.is_dir() else [path]

@@ -27,7 +27,7 @@ from pyklip_diffrender.reduction import (
 from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staged
 
 FOLDER = "combined"
-"""Folder of the searches of stars, in that of the survey."""
+"""Folder of the searches of stars, in the survey's folder."""
 
 Group = Sequence[tuple[Job, Detection]]
 """Jobs of one star with their searches, in order of time."""
@@ -43,7 +43,7 @@ class StarSearch:
     ----------
     star : str
     folder : str
-        In that of the survey.
+        Folder of the search, in the survey's folder.
     jobs : tuple of str
         Names of the jobs.
     combined : dict
