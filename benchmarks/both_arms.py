@@ -5,7 +5,7 @@ Run from the root of the project::
     python -m benchmarks.both_arms [--flat 0.01] [--drift 6e-9]
 
 Frames that the two arms take at the same moment share the telescope's wavefront. A frame of F444W
-and one of F210M behind MASK335R are simulated with the same drift of the mirror since the wavefront
+and one of F210M behind MASK335R are simulated with the same drift of the mirror since the OPD
 map, an error of the flat field in every pixel, photon and read noise, and each is fitted alone.
 By linear theory, what one frame says of the modes, marginalised over all that is its own, is then
 added to the curvature of the other: the errors are those of a fit of both, as if the arms shared
@@ -51,7 +51,7 @@ def frame_of(name: str, opd: np.ndarray, flat: float, seed: int) -> dr.Observati
         np.ones((size, size)), np.ones((size, size)), pixelscale=place.siaf_pixelscale,
         filter=name, header=header, position_angles=[0.0],
     )  # fmt: skip
-    own = dr.random_opd(seed, npix=256, rms=CHROMATIC).data
+    own = dr.wavefront.random_opd(seed, npix=256, rms=CHROMATIC).data
     with torch.no_grad():
         light = dr.model_for(blank, npix=512, nlambda=11)(
             resample(opd + own, 512), (0.002, -0.002)
@@ -65,7 +65,7 @@ def frame_of(name: str, opd: np.ndarray, flat: float, seed: int) -> dr.Observati
     )  # fmt: skip
 
 
-def information(linear: dr.LinearModel) -> tuple[torch.Tensor, torch.Tensor]:
+def information(linear: dr.linear.LinearModel) -> tuple[torch.Tensor, torch.Tensor]:
     """Indices of the modes of a fit, and what its frame says of them, without their prior."""
     mode = torch.tensor([unknown.name == "modes" for unknown in linear.unknowns])
     modes, rest = torch.nonzero(mode).flatten(), torch.nonzero(~mode).flatten()
@@ -76,7 +76,7 @@ def information(linear: dr.LinearModel) -> tuple[torch.Tensor, torch.Tensor]:
     return modes, shared
 
 
-def errors(fit: dr.Refinement, linear: dr.LinearModel) -> tuple[np.ndarray, np.ndarray]:
+def errors(fit: dr.Refinement, linear: dr.linear.LinearModel) -> tuple[np.ndarray, np.ndarray]:
     """Errors of a planet's flux, and for a known star: the median at every separation."""
     angles = np.arange(0, 2 * np.pi, np.pi / 4)
     model, opd = fit.frames[0].model, fit.wavefront
@@ -98,8 +98,8 @@ def main() -> None:
     parser.add_argument("--drift", type=float, default=6e-9)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    sensed = dr.random_opd(1, npix=256).data
-    truth = sensed + dr.random_opd(2, npix=256, rms=options.drift).data
+    sensed = dr.wavefront.random_opd(1, npix=256).data
+    truth = sensed + dr.wavefront.random_opd(2, npix=256, rms=options.drift).data
     fits_of = {}
     for seed, name in enumerate(ARMS, 10):
         frame = frame_of(name, truth, options.flat, seed)

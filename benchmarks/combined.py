@@ -58,7 +58,7 @@ enough for a few in some dozens of searches."""
 def searched(name: str, epoch: int, seed: int) -> Detection:
     """Simulate, fit and search a frame without a planet."""
     model = dr.nircam_coronagraph(name, monochromatic=WAVELENGTHS[name], npix=NPIX, fov_pixels=SIDE)
-    sensed = dr.random_opd(3, npix=NPIX).data
+    sensed = dr.wavefront.random_opd(3, npix=NPIX).data
     basis = JointBasis([SegmentMotions(), FourierModes(CYCLES)])
     # Every epoch has its own drift, which the filters share.
     generator = torch.Generator().manual_seed(10 * seed + epoch)
@@ -71,7 +71,7 @@ def searched(name: str, epoch: int, seed: int) -> Detection:
         position_angles=np.array([15.0 + 60.0 * epoch]),
         date=Time(DATES[epoch]),
     )
-    settings = dr.GaussNewton(basis=basis, response_npix=NPIX)
+    settings = dr.FitSettings(basis=basis, response_npix=NPIX)
     fit = dr.refine(model, frame, sensed, settings=settings)
     return dr.detect(fit, inner=INNER)
 

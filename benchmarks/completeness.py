@@ -32,7 +32,7 @@ def predicted(fit: dr.Refinement, planets: QTable) -> np.ndarray:
     detection = dr.detect(fit)
     away = planets["separation"].to_value("arcsec")
     grid = np.linspace(away.min(), away.max(), 12)
-    table = dr.completeness(detection, separations=grid, strengths=STRENGTHS)
+    table = dr.detection.completeness(detection, separations=grid, strengths=STRENGTHS)
     fractions = np.reshape(table["completeness"], (len(grid), len(STRENGTHS)))
     curve = detection.contrast_curve
     limits = np.interp(away, curve["separation"].to_value("arcsec"), curve["small_sample"])

@@ -40,7 +40,7 @@ def amount(image: Image, light: Image, distance: Image) -> float:
     return float((image * light)[outside].sum() / (light**2)[outside].sum())
 
 
-def klip_of(base: dr.Reduction, sequence: dr.Sequence) -> KlipSubtraction:
+def klip_of(base: dr.Reduction, sequence: dr.ExposureSequence) -> KlipSubtraction:
     """KLIP for the frames as they were taken, with those of all other stars of the sequence."""
     resolution = base.detection.contrast_curve.meta["resolution_arcsec"]
     references = sequence.cutout(SIZE).references
@@ -109,8 +109,8 @@ def main() -> None:
     parser.add_argument("--figure", type=Path)
     options = parser.parse_args()
 
-    def read(target: str) -> dr.Sequence:
-        return dr.Sequence.from_files(options.frames, target=target, filter=options.filter)
+    def read(target: str) -> dr.ExposureSequence:
+        return dr.ExposureSequence.from_files(options.frames, target=target, filter=options.filter)
 
     sequence = read("V-AU-MIC")
     reduction = dr.reduce(replace(sequence, references=()), options.opd, disk=True)
@@ -144,11 +144,11 @@ def main() -> None:
         for each, image in zip(bare.sequence.science, light, strict=True)
     )
     found = dr.reduce(replace(bare.sequence, science=science), options.opd,
-                      systematics=bare.systematics or "off", disk=True)  # fmt: skip
+                      pattern=bare.pattern or "off", disk=True)  # fmt: skip
     assert found.disk is not None
     star_only = replace(bare.sequence, science=science)
     alone = dr.refine(bare.fit.model, star_only.science, bare.fit.initial,
-                      systematics=bare.systematics)  # fmt: skip
+                      pattern=bare.pattern)  # fmt: skip
     print("HIP 17695 with the disk:", found.disk)
     klip = klip_of(bare, sequence)
     kept = amount(found.disk.light[0], light[0], klip.distance)

@@ -47,7 +47,7 @@ class Filter:
     """
 
     name: str
-    linear: dr.LinearModel
+    linear: dr.linear.LinearModel
     images: dict[int, torch.Tensor]
     modes: torch.Tensor
     shared: torch.Tensor
@@ -75,7 +75,7 @@ class Filter:
         return np.asarray(np.median(errors.reshape(len(SEPARATIONS), -1), axis=1))
 
 
-def information(linear: dr.LinearModel, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+def information(linear: dr.linear.LinearModel, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Indices of the leading modes, and what the frames say of them, without their prior."""
     leading = torch.tensor(
         [each.name == "modes" and each.component < count for each in linear.unknowns]

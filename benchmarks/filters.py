@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--planets", type=int, default=14)
     options = parser.parse_args()
     sensed = dr.read_opd(options.data / "opd_2022-08-14.fits.gz")
-    opd = sensed.data + dr.random_opd(5, npix=sensed.data.shape[-1], rms=CHANGE).data
+    opd = sensed.data + dr.wavefront.random_opd(5, npix=sensed.data.shape[-1], rms=CHANGE).data
     for name in options.filters:
         filter, _, mask = name.partition(":")
         mask = mask or "MASK335R"

@@ -22,12 +22,12 @@ from astropy.table import Table
 
 import pyklip_diffrender as dr
 from benchmarks.provenance import processor
-from pyklip_diffrender.scene import Sequence
+from pyklip_diffrender.scene import ExposureSequence
 
 Limits = dict[str, Any]
 
 
-def reduced(frames: Sequence, opd: Path, accuracy: Any) -> Limits:
+def reduced(frames: ExposureSequence, opd: Path, accuracy: Any) -> Limits:
     """Processor time, flux, status, and limits as contrasts by separation."""
     began = time.process_time()
     reduction = dr.reduce(frames, opd, accuracy=accuracy)
@@ -76,7 +76,7 @@ def main() -> None:
     for (star, band), paths in groups.items():
         rolls = [(f"roll {k + 1}", [path]) for k, path in enumerate(paths)]
         for name, used in [*rolls, (f"{len(paths)} rolls", paths)] if len(paths) > 1 else rolls:
-            both = (reduced(Sequence.from_files(used), options.opd, each)
+            both = (reduced(ExposureSequence.from_files(used), options.opd, each)
                     for each in ("quick", "full"))  # fmt: skip
             rows.append({"star": star, "filter": band, "frames": name, **compared(*both)})
             print(rows[-1], flush=True)

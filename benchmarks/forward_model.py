@@ -135,7 +135,7 @@ class Trial(Planet):
     def __init__(self, seed: int, contrast: float) -> None:
         rng = np.random.default_rng(seed)
         super().__init__(rng, rng.uniform(9.0, 15.0), rng.uniform(0.0, 360.0), contrast)
-        self.measured = dr.random_opd(seed, npix=128)
+        self.measured = dr.wavefront.random_opd(seed, npix=128)
         drifts = [random_drift(100 * seed + k, h, npix=128).data
                   for k, h in enumerate((DRIFT, REFERENCE_DRIFT))]  # fmt: skip
         camera = dr.nircam_coronagraph("F444W", fov_pixels=SIDE, **NUMERICS)
@@ -206,17 +206,17 @@ class Trial(Planet):
             spectrallib_units="contrast",
         )  # fmt: skip
         if settings:
-            dataset.diffrender = dr.DiffrenderSettings(
+            dataset.diffrender = dr.pyklip_backend.DiffrenderSettings(
                 opd=self.measured,
                 model=dr.nircam_coronagraph("F444W", fov_pixels=SIDE, **NUMERICS),
                 error=np.sqrt(self.frames),
-                fit=dr.GaussNewton(basis=default_basis(12.0), response_npix=128),
+                settings=dr.FitSettings(basis=default_basis(12.0), response_npix=128),
                 **settings,
             )
         with (
             tempfile.TemporaryDirectory() as folder,
             contextlib.redirect_stdout(io.StringIO()),
-            dr.backend() if settings else contextlib.nullcontext(),
+            dr.pyklip_backend.backend() if settings else contextlib.nullcontext(),
         ):
             fm.klip_dataset(
                 dataset, planet, mode=mode, outputdir=folder, fileprefix="x", annuli=1,

@@ -52,7 +52,7 @@ class Frames:
     """
 
     def __init__(self, folder: Path, opd: Path, target: str, filter: str) -> None:
-        sequence = dr.Sequence.from_files(folder, target=target, filter=filter)
+        sequence = dr.ExposureSequence.from_files(folder, target=target, filter=filter)
         self.opd = opd
         self.paths = [self._path(folder, each) for each in sequence.science]
         self.references = [str(self._path(folder, each)) for each in sequence.references]
@@ -132,7 +132,7 @@ def measured(frames: Frames, planet: Planet, mode: str, algorithm: str | None) -
     with (
         tempfile.TemporaryDirectory() as name,
         contextlib.redirect_stdout(io.StringIO()),
-        dr.backend(opd=frames.opd) if algorithm else contextlib.nullcontext(),
+        dr.pyklip_backend.backend(opd=frames.opd) if algorithm else contextlib.nullcontext(),
     ):
         folder = Path(name)
         paths = frames.with_planet(planet, folder)

@@ -70,8 +70,8 @@ def make_frames(folder: Path, real: Path | None = None) -> Path:
     return folder
 
 
-def _sequence(folder: Path) -> dr.Sequence:
-    return dr.Sequence.from_files(folder, filter="F444W")
+def _sequence(folder: Path) -> dr.ExposureSequence:
+    return dr.ExposureSequence.from_files(folder, filter="F444W")
 
 
 def run(
@@ -171,11 +171,13 @@ def _source(name: str) -> str:
     return name.partition(" (pointing")[0].partition(" and ")[0]
 
 
-def _all(sequence: dr.Sequence) -> list[Observation]:
+def _all(sequence: dr.ExposureSequence) -> list[Observation]:
     return [*sequence.science, *sequence.references]
 
 
-def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation]) -> list[str]:
+def _faults(
+    sequence: dr.ExposureSequence, folder: Folder, twin: dict[str, Observation]
+) -> list[str]:
     """What is wrong with an admitted sequence."""
     faults = []
     used: Counter[str] = Counter()
@@ -266,9 +268,9 @@ def _differences(
     return faults
 
 
-def _fit(sequence: dr.Sequence) -> np.ndarray:
+def _fit(sequence: dr.ExposureSequence) -> np.ndarray:
     """Limits at 0.5, 0.8 and 1.1 arcsec of a small fit."""
-    settings = replace(dr.GaussNewton.nircam(sequence.filter), cycles=_CYCLES)
+    settings = replace(dr.FitSettings.nircam(sequence.filter), cycles=_CYCLES)
     alone = replace(sequence, references=())
     reduction = dr.reduce(alone, "flat", size=_SIZE, settings=settings)
     curve = reduction.detection.contrast_curve

@@ -60,10 +60,10 @@ def opd_of(data: Path, star: str = "") -> Path:
     return data / ("opd_2022-07-30.fits.gz" if star == "HIP-65426" else "opd_2022-08-14.fits.gz")
 
 
-def frames_of(data: Path, star: str, band: str = "F444W") -> dr.Sequence:
+def frames_of(data: Path, star: str, band: str = "F444W") -> dr.ExposureSequence:
     if star == "HIP-65426":
-        return dr.Sequence.from_files([data / "hip65426_f444w_calints.fits.gz"])
-    return dr.Sequence.from_files(data / "gto1184", target=star, filter=band)
+        return dr.ExposureSequence.from_files([data / "hip65426_f444w_calints.fits.gz"])
+    return dr.ExposureSequence.from_files(data / "gto1184", target=star, filter=band)
 
 
 def reduced(
@@ -138,7 +138,7 @@ def through_pyklip(data: Path) -> Numbers:
     files = sorted(str(each) for each in (data / "gto1184").glob("jw0118400[56]001_03106_*"))
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        dr.register(opd=opd_of(data), fit_pixels=36)
+        dr.register(opd=opd_of(data), size=36)
         try:
             dataset = JWSTData(files, None, highpass=False)
             klip_dataset(
@@ -146,7 +146,7 @@ def through_pyklip(data: Path) -> Numbers:
                 fileprefix="star", algo="diffrender", numthreads=1, verbose=False,
             )  # fmt: skip
         finally:
-            dr.unregister()
+            dr.pyklip_backend.unregister()
         image = fits.getdata(Path(folder) / "star-KLmodes-all.fits")[0]
     known = np.isfinite(image)
     return {
@@ -183,7 +183,7 @@ CASES: dict[str, Callable[[Path], Numbers]] = {
     },
     "G-7-34, F444W, with references": partial(_reduction, *PAIR, with_references=True),
     "G-7-34, F444W, own pattern": partial(
-        _reduction, *PAIR, with_references=True, systematics="references"
+        _reduction, *PAIR, with_references=True, pattern="references"
     ),
     "combined": combined,
     "command line": through_command_line,

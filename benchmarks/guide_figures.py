@@ -31,7 +31,7 @@ from pyklip_diffrender import drawing
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 NPIX, SIDE, WAVELENGTH = 128, 40, 4.5e-6
-SETTINGS = dr.GaussNewton(cycles=6)
+SETTINGS = dr.FitSettings(cycles=6)
 PLANET = dr.Planet(2e-6, 0.75, 120.0)
 ROLLS = (0.0, 12.0)
 
@@ -44,7 +44,7 @@ def model() -> dr.OpticalSystem:
 
 def opd(seed: int = 1, change: float = 0.0) -> NDArray[np.float64]:
     """A wavefront, moved by a fraction of the way to another one, (npix, npix) in m."""
-    first, other = (dr.random_opd(each, npix=NPIX).data for each in (seed, seed + 1))
+    first, other = (dr.wavefront.random_opd(each, npix=NPIX).data for each in (seed, seed + 1))
     return np.asarray(first + change * (other - first))
 
 
@@ -76,7 +76,7 @@ def status_figure() -> Figure:
     """A frame, its star and the residual, for a fit that explains it and one that does not."""
     figure, axes = drawing.new_figure(2, 3)
     figure.set_size_inches(13.8, 7.2)
-    settings = dr.GaussNewton(cycles=(6, 12))
+    settings = dr.FitSettings(cycles=(6, 12))
     seen = frame(3, planets=())
     explained = dr.refine(model(), seen, opd(), settings=settings)
     pattern = 1 + 0.01 * np.random.default_rng(5).normal(size=(SIDE, SIDE))
@@ -91,7 +91,7 @@ def status_figure() -> Figure:
 
 
 def pattern_figure() -> Figure:
-    """The library's flat-field pattern of F444W and F356W about the place of the star."""
+    """The library's detector pattern of F444W and F356W about the place of the star."""
     figure, axes = drawing.new_figure(1, 2)
     for ax, name in zip(axes[0], ("F444W", "F356W"), strict=True):
         ones = np.ones((80, 80))
@@ -99,12 +99,12 @@ def pattern_figure() -> Figure:
         seen = dr.Observation.from_arrays(
             ones, ones, pixelscale=0.063, filter=name, header=fits.Header(header)
         )
-        known = dr.known_systematics(seen)
+        known = dr.known_pattern(seen)
         assert known is not None
-        y, x = np.indices(known.pattern.shape)
+        y, x = np.indices(known.value.shape)
         grid = np.stack([x - known.center[0], y - known.center[1]], axis=-1) * 0.063
         drawing.signed_image(
-            ax, 100 * known.pattern, grid, 10.0, bar="% of the starlight", title=name
+            ax, 100 * known.value, grid, 10.0, bar="% of the starlight", title=name
         )
     return figure
 
@@ -181,11 +181,11 @@ def klip_figure() -> Figure:
                 filenames=np.array([each.name for each in frames]), IWA=3,
             )  # fmt: skip
             settings = {
-                "model": model(), "fit": SETTINGS, "fit_pixels": SIDE, "filter": "F444W",
+                "model": model(), "settings": SETTINGS, "size": SIDE, "filter": "F444W",
                 "error": np.sqrt(np.maximum(cube, 1.0)), "opd": opd(),
             }  # fmt: skip
             # Inside the block of the backend, "klip" would be taken over as well.
-            with dr.backend(**settings) if algorithm != "klip" else nullcontext():
+            with dr.pyklip_backend.backend(**settings) if algorithm != "klip" else nullcontext():
                 klip_dataset(
                     dataset, mode="ADI", annuli=1, subsections=1, movement=1, numbasis=[1],
                     outputdir=folder, fileprefix=algorithm, algo=algorithm, verbose=False,
@@ -313,7 +313,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "guide_getting_started": first_figure,
     "guide_concepts": marginalised_figure,
     "guide_status": status_figure,
-    "guide_systematics": pattern_figure,
+    "guide_detector_pattern": pattern_figure,
     "guide_pyklip": klip_figure,
     "guide_spaceklip": spaceklip_figure,
     "guide_survey": survey_figure,

@@ -113,7 +113,9 @@ def main() -> None:
     parser.add_argument("--gaussian", action="store_true")
     parser.add_argument("--disk", type=float, metavar="ANGLE")
     options = parser.parse_args()
-    sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
+    sequence = dr.ExposureSequence.from_files(
+        options.frames, target=options.target, filter=options.filter
+    )
     names = [
         [str(next(options.frames.rglob(Path(each.name).name))) for each in part]
         for part in (sequence.science, sequence.references)
@@ -123,7 +125,9 @@ def main() -> None:
     plain = {name: copy.deepcopy(dataset) for name in ("KLIP", OURS)}
     images = {"KLIP": reduced(plain["KLIP"], "klip", MODES)}
     first = plain[OURS]
-    first.diffrender = dr.DiffrenderSettings(image=OURS, disk=options.disk is not None)
+    first.diffrender = dr.pyklip_backend.DiffrenderSettings(
+        image=OURS, disk=options.disk is not None
+    )
     images[OURS] = reduced(first, "diffrender", [1])
     fit = first.diffrender_results[0].subtraction.fits[0].result
     model = fit.model
@@ -152,7 +156,9 @@ def main() -> None:
                 copied = copy.deepcopy(dataset)
                 if name == OURS:
                     # The frames are fitted once.
-                    copied.diffrender = dr.DiffrenderSettings(image=name, injected_into=first)
+                    copied.diffrender = dr.pyklip_backend.DiffrenderSettings(
+                        image=name, injected_into=first
+                    )
                 planets = [peak if stamp is None else peak * stamp] * len(copied.input)
                 fakes.inject_planet(
                     copied.input, copied.centers, planets, copied.wcs, *place, fwhm=fwhm

@@ -193,7 +193,7 @@ _BRIGHTEST = 900.0
 def _point_source() -> np.ndarray:
     """Image of a source outside the mask, with its peak of 1 in the middle, (201, 201)."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=512, fov_pixels=281)
-    image = model(dr.random_opd(1, npix=512), (0.0, 2.5)).double().detach().numpy()
+    image = model(dr.wavefront.random_opd(1, npix=512), (0.0, 2.5)).double().detach().numpy()
     row, column = np.unravel_index(int(image.argmax()), image.shape)
     return np.asarray(image[row - 100 : row + 101, column - 100 : column + 101] / image.max())
 

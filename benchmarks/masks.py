@@ -90,7 +90,7 @@ def stpsf_cells(name: str) -> tuple[list[str], float]:
 def own_cells(name: str) -> tuple[list[str], float]:
     """Time and error of this package for a mask, and the time, s."""
     aperture, band, wavelength = MASKS[name]
-    opd = torch.from_numpy(dr.random_opd(1, npix=NPIX).data)
+    opd = torch.from_numpy(dr.wavefront.random_opd(1, npix=NPIX).data)
     images = {}
     for cells in (8, 2):
         model = dr.nircam_coronagraph(

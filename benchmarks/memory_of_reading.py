@@ -73,12 +73,12 @@ def measure(path: Path, dataset: bool) -> tuple[float, float]:
 
             dr.register(opd="flat")
             JWSTData([str(warm)])
-        dr.Sequence.from_files(warm)
+        dr.ExposureSequence.from_files(warm)
         before, began = peak(), time.process_time()
         if dataset:
             JWSTData([str(path)])
         else:
-            dr.Sequence.from_files(path)
+            dr.ExposureSequence.from_files(path)
         return peak() - before, time.process_time() - began
 
 

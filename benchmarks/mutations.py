@@ -90,7 +90,7 @@ def _kinds(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
     config = folder / "survey.toml"
     config.write_text(
         'workers = 2\nmemory_limit = "4 GB"\n\n[options]\nsize = 80\nthreshold = 5.0\n'
-        'systematics = "auto"\nsettings = { cycles = [12.0, 18.0], robust = 3.0 }'
+        'pattern = "auto"\nsettings = { cycles = [12.0, 18.0], robust = 3.0 }'
         '\n\n[injections]\ncontrasts = [1e-5, 3e-6]\nseparations = [0.5]\nangles = [0, 90.0]\n\n'
         '[[sequence]]\nname = "HIP 1"\nfiles = ["frames/a.fits"]\ntarget = "HIP 1"\n'
         'filter = "F444W"\nopd = "frames/map.fits"\n',
@@ -135,7 +135,7 @@ def _fit(path: Path) -> None:
     import pyklip_diffrender as dr
 
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(dr.Star(exposure=20.0)), opd, seed=3)
-    settings = dr.GaussNewton(cycles=3, max_iterations=3)
+    settings = dr.FitSettings(cycles=3, max_iterations=3)
     dr.refine(model, frame, opd, settings=settings).write(path)

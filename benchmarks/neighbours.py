@@ -6,7 +6,7 @@ Run from the root of the project::
 
 FRAMES is the folder with the calints files of programme 1184. A source is added to both rolls of
 G 7-34 in F444W, as the fit of the untouched files renders it, with photon noise and the errors that
-it adds, but without the flat-field pattern, which real companions hardly show. The changed files
+it adds, but without the detector pattern, which real companions hardly show. The changed files
 are reduced with the defaults. A row says whether both files were used as before, whether the source
 is among the companions of the fit and the candidates, its measured contrast and position, what was
 found that the untouched frames do not show, and the ratio of the limits further than 1.5 lambda/D
@@ -72,7 +72,7 @@ def sources_of(case: tuple[float, float]) -> NDArray[Any]:
 
 
 def light_of(
-    reduction: dr.Reduction, cut: dr.Sequence, sources: NDArray[Any]
+    reduction: dr.Reduction, cut: dr.ExposureSequence, sources: NDArray[Any]
 ) -> list[NDArray[Any]]:
     """Light of the sources in each frame of `cut`, (ny, nx), on the pixels of the detector."""
     frames = reduction.fit.frames
@@ -92,7 +92,7 @@ def light_of(
 
 
 def with_source(
-    paths: list[Path], folder: Path, sequence: dr.Sequence, lights: list[NDArray[Any]]
+    paths: list[Path], folder: Path, sequence: dr.ExposureSequence, lights: list[NDArray[Any]]
 ) -> None:
     """Write the files with the light added, shifted as the alignment has shifted the frames.
 
@@ -102,7 +102,7 @@ def with_source(
         Of the two rolls.
     folder : Path
         For the changed files.
-    sequence : Sequence
+    sequence : ExposureSequence
         The untouched frames, on the pixels of the detector.
     lights : list of ndarray, (ny, nx)
         See `light_of`.
@@ -144,12 +144,12 @@ def one(frames: Path, opd: Path, base: dict[str, Any], case: tuple[float, float]
     sources = sources_of(case)
     row: dict[str, Any] = {"contrast": case[0], "separation": case[1], "outcome": "as before"}
     paths = sorted(frames.glob(NAMES))
-    sequence = dr.Sequence.from_files(paths)
+    sequence = dr.ExposureSequence.from_files(paths)
     with tempfile.TemporaryDirectory() as place:
         lights = light_of(base["untouched"], sequence.cutout(SIDE), sources)
         with_source(paths, Path(place), sequence, lights)
         try:
-            changed = dr.Sequence.from_files(place)
+            changed = dr.ExposureSequence.from_files(place)
         except DiffrenderError as error:
             return row | {"outcome": f"refused: {error}"}
         if changed.excluded or len(changed.science) != len(sequence.science):
@@ -227,7 +227,7 @@ def main() -> None:
         cases = [(0.0, float(number)) for number in range(options.fields)]
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    sequence = dr.Sequence.from_files(sorted(options.frames.glob(NAMES)))
+    sequence = dr.ExposureSequence.from_files(sorted(options.frames.glob(NAMES)))
     untouched = dr.reduce(sequence, options.map, wide=options.wide)
     base = {
         "first": [each.first_pixel for each in sequence.science],

@@ -52,11 +52,11 @@ class DriftedStar:
     def observed(self, expected, seed, **details):
         return observed(expected, seed, self.model.detector.pixelscale, **details)
 
-    def refined(self, observation, *, start=None, systematics=None, **changes):
+    def refined(self, observation, *, start=None, pattern=None, **changes):
         settings = {"basis": self.basis, "response_npix": self.model.npix, **changes}
         return dr.refine(
-            self.model, observation, self.opd, settings=dr.GaussNewton(**settings), start=start,
-            systematics=systematics,
+            self.model, observation, self.opd, settings=dr.FitSettings(**settings), start=start,
+            pattern=pattern,
         )  # fmt: skip
 
     def fitted(self, seed, *planets):

@@ -55,7 +55,7 @@ class Outcome:
 
 
 def searched(seed: int, **settings: Any) -> Outcome:
-    """Simulate, fit and search one scene, with fields of `GaussNewton` other than the defaults."""
+    """Simulate, fit and search one scene, with fields of `FitSettings` other than the defaults."""
     rng = np.random.default_rng(seed)
     low, high = (-2, -1) if seed % 5 == 4 else (-5, -2)
     contrast = 10 ** rng.uniform(low, high)
@@ -63,10 +63,10 @@ def searched(seed: int, **settings: Any) -> Outcome:
     separation, angle = min(10 ** rng.uniform(-1, np.log10(2)), reach), rng.uniform(0, 360)
     planet = dr.Planet(contrast, separation, angle)
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=NPIX, fov_pixels=PIXELS)
-    before, change = (dr.random_opd(k, npix=NPIX) for k in (2 * seed, 2 * seed + 1))
+    before, change = (dr.wavefront.random_opd(k, npix=NPIX) for k in (2 * seed, 2 * seed + 1))
     now = replace(before, data=before.data + DRIFT * change.data)
     frame = dr.simulate(model, dr.Scene(planets=(planet,)), now, seed=seed)
-    fit = dr.refine(model, frame, before, settings=dr.GaussNewton(**settings))
+    fit = dr.refine(model, frame, before, settings=dr.FitSettings(**settings))
     words = f"{seed}: {contrast:.2g} at {separation:.3f} arcsec, {fit.status.name}"
     if not fit.status.usable:
         return Outcome("the fit says that it failed", words)

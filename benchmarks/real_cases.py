@@ -88,10 +88,10 @@ def reduce_case(
     most = planets if pair else min(planets, 3)
     injections = most if STARS.get(star) == "star" else 0
     if star == "HIP-65426":
-        sequence = dr.Sequence.from_files([data / "hip65426_f444w_calints.fits.gz"])
+        sequence = dr.ExposureSequence.from_files([data / "hip65426_f444w_calints.fits.gz"])
         opd = data / "opd_2022-07-30.fits.gz"
     else:
-        sequence = dr.Sequence.from_files(data / "gto1184", target=star, filter=band)
+        sequence = dr.ExposureSequence.from_files(data / "gto1184", target=star, filter=band)
         opd = data / "opd_2022-08-14.fits.gz"
     science = sequence.science if pair else sequence.science[int(rolls[-1]) - 1 :][:1]
     others = [each for each in sequence.references if STARS.get(each.target) == "star"]

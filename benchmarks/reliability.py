@@ -168,7 +168,7 @@ def real_system(data, star):
     opd, reductions, dates = data / "opd_2022-08-14.fits.gz", [], [0.0, 0.0]
     moved = -PROPER * LATER / YEAR
     for band, colour in zip(FILTERS, (1.0, 0.7), strict=True):
-        sequence = dr.Sequence.from_files(data / "gto1184", target=star, filter=band)
+        sequence = dr.ExposureSequence.from_files(data / "gto1184", target=star, filter=band)
         for k, roll in enumerate(sequence.science):
             alone = replace(sequence, science=(roll,), references=())
             (frame,) = dr.reduce(alone, opd, accuracy="quick").fit.frames

@@ -50,7 +50,7 @@ from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.reduction import ReduceOptions, prepare
-from pyklip_diffrender.refinement import GaussNewton, Refinement, nircam_settings, refine
+from pyklip_diffrender.refinement import FitSettings, Refinement, nircam_settings, refine
 from pyklip_diffrender.wavefront.bases import default_basis
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -227,7 +227,7 @@ def fit_points(setting: Setting) -> list[Point]:
             model,
             setting.observation,
             setting.measured.cpu().numpy(),
-            settings=GaussNewton(basis=default_basis(highest), **quick),
+            settings=FitSettings(basis=default_basis(highest), **quick),
         )
         return result, time.perf_counter() - began
 
@@ -300,7 +300,7 @@ def klip_points(path: Path) -> list[Point]:
 
 def reduction_points(frames: Sequence[Path], opd: Path, *, quick: bool) -> list[Point]:
     """Reductions of real frames with fewer wavelengths and modes; limits against finer ones."""
-    sequence = dr.Sequence.from_files(list(frames))
+    sequence = dr.ExposureSequence.from_files(list(frames))
     first = sequence.science[0]
     size = 32 if quick else 80
     # As `reduce` has it where its pattern is known.
@@ -440,7 +440,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--device", default="cpu", help="torch device of this package")
     parser.add_argument("--frames", nargs="+", type=Path, metavar="FILE", help="real frames")
-    parser.add_argument("--opd", type=Path, metavar="FILE", help="wavefront map of the frames")
+    parser.add_argument("--opd", type=Path, metavar="FILE", help="OPD map of the frames")
     parser.add_argument("--figure", type=Path, metavar="TABLE", help="only draw a table again")
     options = parser.parse_args(arguments)
     options.output.mkdir(parents=True, exist_ok=True)

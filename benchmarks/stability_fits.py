@@ -40,7 +40,7 @@ def model(dtype=torch.float64):
 @lru_cache(maxsize=1)
 def old():
     """The wavefront that fits start from, m."""
-    return dr.random_opd(3, npix=NPIX).data
+    return dr.wavefront.random_opd(3, npix=NPIX).data
 
 
 @lru_cache(maxsize=1)
@@ -90,7 +90,7 @@ def error_of(image, truth=None):
 def fitted(frame, opd=None, dtype=torch.float64, **options):
     """The fit, from the old wavefront unless another is given."""
     start = options.pop("start", None)
-    settings = dr.GaussNewton(**{"basis": FEW, "response_npix": NPIX, **options})
+    settings = dr.FitSettings(**{"basis": FEW, "response_npix": NPIX, **options})
     return dr.refine(
         model(dtype), frame, old() if opd is None else opd, settings=settings, start=start
     )
@@ -113,7 +113,7 @@ PRIOR = 4.0
 
 def piston_of_segments():
     """18 pistons are free; what they have in common is invisible."""
-    prior = dr.WavefrontPrior({"segment": PRIOR, "texture": 3.0}, fit_scales=False)
+    prior = dr.wavefront.WavefrontPrior({"segment": PRIOR, "texture": 3.0}, fit_scales=False)
     fit = fitted(observed(star()), basis=MORE, prior=prior)
     found = fit.frames[0].coefficients
     covariance = fit.linear.covariance.numpy()[-len(MORE) :, -len(MORE) :]

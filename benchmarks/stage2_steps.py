@@ -181,7 +181,7 @@ STEPS: dict[str, Callable[[fits.HDUList], None]] = {
 def measured(folder: Path, opd: Path) -> dict[str, Any]:
     """Reduce the files of a folder; numbers, or the reason why there are none."""
     try:
-        sequence = dr.Sequence.from_files(folder)
+        sequence = dr.ExposureSequence.from_files(folder)
         if len(sequence.science) < 2:
             return {"outcome": f"excluded: {'; '.join(map(str, sequence.excluded))}"}
         reduction = dr.reduce(sequence, opd, accuracy="quick", size=SIZE)
@@ -211,7 +211,7 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     paths = sorted(options.frames.glob(NAMES))
-    sequence = dr.Sequence.from_files(paths)
+    sequence = dr.ExposureSequence.from_files(paths)
     untouched = dr.reduce(sequence, options.opd, accuracy="quick", size=SIZE)
     lights = light_of(untouched, sequence.cutout(SIDE), sources_of(SOURCE))
     table: list[dict[str, Any]] = []

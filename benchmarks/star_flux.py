@@ -26,7 +26,7 @@ from pyklip_diffrender.refinement import jansky_per_unit, with_star_flux
 SHARES = (1.0, 0.9, 1.1, 1.2)
 
 
-def from_flat(sequence: dr.Sequence, opd: Path) -> None:
+def from_flat(sequence: dr.ExposureSequence, opd: Path) -> None:
     """Print the star's flux of fits from a flat wavefront over that of fits from a map."""
     rolls = {f"roll {k + 1}": (each,) for k, each in enumerate(sequence.science)}
     if len(sequence.science) > 1:
@@ -47,7 +47,9 @@ def main() -> None:
     parser = real_frames_parser(__doc__, target=None, band=None)
     parser.add_argument("--flat", action="store_true")
     options = parser.parse_args()
-    sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
+    sequence = dr.ExposureSequence.from_files(
+        options.frames, target=options.target, filter=options.filter
+    )
     if options.flat:
         from_flat(sequence, options.opd)
         return

@@ -46,7 +46,7 @@ from benchmarks.calints_files import calints
 from pyklip_diffrender.instrument import detector_place, filter_shift
 from pyklip_diffrender.optics import resample
 from pyklip_diffrender.reduction.klip import klip_curve
-from pyklip_diffrender.scene import Planet, Sequence
+from pyklip_diffrender.scene import ExposureSequence, Planet
 
 ROLLS = (70.0, 80.0)
 DRIFT, BETWEEN = 6e-9, 2e-9
@@ -154,7 +154,7 @@ def instrument_of(case: Case) -> Any:
 
 
 def map_of(nircam: Any) -> tuple[np.ndarray, fits.Header]:
-    """The wavefront map that stpsf comes with, m."""
+    """The OPD map that stpsf comes with, m."""
     path = Path(os.environ["STPSF_PATH"]) / Path(str(nircam.pupilopd)).name
     with fits.open(path) as hdus:
         scale = u.Unit(hdus[0].header["BUNIT"].rstrip("s")).to(u.m)
@@ -238,7 +238,7 @@ def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0)
 
 
 def _change(seed: int, rms: float, opd: np.ndarray) -> np.ndarray:
-    return np.asarray(resample(dr.random_opd(seed, npix=256, rms=rms).data, len(opd)))
+    return np.asarray(resample(dr.wavefront.random_opd(seed, npix=256, rms=rms).data, len(opd)))
 
 
 def _write(
@@ -289,7 +289,7 @@ def reduced(case: Case, folder: Path, references: int = 0, repeat: int = 0) -> d
     if len(list((folder / "frames").glob("*.fits"))) < len(ROLLS) + references:
         before = write_frames(case, folder, references, repeat)
     made = time.process_time() - made
-    sequence = Sequence.from_files(folder / "frames", target="HD 1")
+    sequence = ExposureSequence.from_files(folder / "frames", target="HD 1")
     began = time.process_time()
     size = case.size if case.accuracy == "full" else None
     reduction = dr.reduce(sequence, before, size=size, accuracy=case.accuracy)

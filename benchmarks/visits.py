@@ -42,7 +42,7 @@ from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.instrument import detector_place
 from pyklip_diffrender.optics import resample
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.scene import Planet, Sequence
+from pyklip_diffrender.scene import ExposureSequence, Planet
 
 NPIX = 512
 DITHERS = (*made.DITHERS, (0.0, 0.02), (0.02, 0.0), (0.0, -0.02), (-0.02, 0.0))
@@ -113,7 +113,7 @@ def write_frames(visit: Visit, folder: Path) -> Path:
     rng = np.random.default_rng([11, visit.number])
     case, side = visit.case, visit.case.side
     seeds = rng.integers(2**31, size=2 + visit.rolls + visit.dithers)
-    opd = np.asarray(dr.random_opd(int(seeds[0]), npix=NPIX, rms=6e-8).data)
+    opd = np.asarray(dr.wavefront.random_opd(int(seeds[0]), npix=NPIX, rms=6e-8).data)
     before = folder / "opd_2022-10-01.fits"
     hdu = fits.PrimaryHDU(opd)
     hdu.header["BUNIT"] = "m"
@@ -163,7 +163,7 @@ def write_frames(visit: Visit, folder: Path) -> Path:
 
 
 def _change(seed: int, rms: float) -> np.ndarray:
-    return np.asarray(resample(dr.random_opd(seed, npix=256, rms=rms).data, NPIX))
+    return np.asarray(resample(dr.wavefront.random_opd(seed, npix=256, rms=rms).data, NPIX))
 
 
 def reduced(visit: Visit, folder: Path) -> dict[str, Any]:
@@ -173,7 +173,7 @@ def reduced(visit: Visit, folder: Path) -> dict[str, Any]:
         return dict(json.loads(done.read_text(encoding="utf-8")))
     folder.mkdir(parents=True, exist_ok=True)
     before = write_frames(visit, folder)
-    sequence = Sequence.from_files(folder / "frames", target="HD 1")
+    sequence = ExposureSequence.from_files(folder / "frames", target="HD 1")
     size, seconds, results, stars = visit.case.size, {}, {}, {}
     for use in ("joint", "off") if visit.case.planets else ("joint",):
         began = time.process_time()

@@ -48,7 +48,7 @@ autodoc_typehints = "none"
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
 numpydoc_xref_aliases = {name: f"pyklip_diffrender.errors.{name}" for name in errors.__all__}
-numpydoc_xref_aliases["OPDMap"] = "pyklip_diffrender.wavefront.opd.OPDMap"
+numpydoc_xref_aliases["OPDMap"] = "pyklip_diffrender.wavefront.OPDMap"
 
 # References have to exist, but for words that stand in single backticks or in the type of a
 # parameter, other projects, attributes of dataclasses, and helpers that have no page.
@@ -56,7 +56,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:obj", r"[^.]*"),
     ("py:obj", r"(poppy|pyklip|spaceKLIP|stpsf|torch|webbpsf)\..*"),
-    ("py:obj", r"(GaussNewton|RoundMask|calibration|contrast|spectrum)\..*"),
+    ("py:obj", r"(FitSettings|RoundMask|calibration|contrast|spectrum)\..*"),
     ("py:obj", r"pyklip_diffrender\.(linear|pyklip_backend\.subtract|scene\.integrations)\..*"),
 ]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
@@ -151,7 +151,25 @@ def _mark_short_cells(app, doctree):
                 text.parent.replace(text, whole)
 
 
+def _named_alone(app, env, node, contnode):
+    """Link a name without its package to the only page that documents it."""
+    domain, target = env.get_domain("py"), node.get("reftarget", "")
+    found = [
+        name
+        for name, each in domain.objects.items()
+        if name.endswith(f".{target}")
+        and not each.aliased
+        and ("." in target or each.objtype in ("class", "function"))
+    ]
+    if node.get("refdomain") != "py" or len(found) != 1:
+        return None
+    return domain.resolve_xref(
+        env, node["refdoc"], app.builder, node["reftype"], found[0], node, contnode
+    )
+
+
 def setup(app):
+    app.connect("missing-reference", _named_alone)
     app.add_html_math_renderer(
         "mathml", inline_renderers=(_inline_math, None), block_renderers=(_display_math, None)
     )

@@ -79,7 +79,7 @@ def _in_a_command(name: str, value: Any) -> str:
 
 
 _DATA = "../validation/real_frames.md"
-_PATTERN = "systematics.md#a-library-of-your-own"
+_PATTERN = "detector_pattern.md#a-library-of-your-own"
 
 SITUATIONS = (
     Situation(
@@ -104,7 +104,7 @@ SITUATIONS = (
     ),
     Situation(
         "reference stars of other epochs or programmes", "They teach the pattern where the library "
-        "has none, and are in KLIP's curve.", {"systematics": "references"},
+        "has none, and are in KLIP's curve.", {"pattern": "references"},
         "to learn from them beside the library. Give their files with the target's.",
         "A fit of each star at each epoch, as long as the target's.",
     ),
@@ -127,14 +127,14 @@ SITUATIONS = (
         "`MODEL_MISMATCH`.",
     ),
     Situation(
-        "no wavefront map", "Asks for one.", {"star_flux": "0.45 Jy"},
+        "no OPD map", "Asks for one.", {"star_flux": "0.45 Jy"},
         'with the map `"flat"` (`--opd flat`); or fetch the map of the day (`--opd mast`)',
         f"Nearly the same limits in twice the time, but [the star's flux is uncertain]({_DATA}"
-        "#the-wavefront-map) unless you state it.",
+        "#the-opd-map) unless you state it.",
     ),
     Situation(
         "a filter, mask or pipeline version without a pattern", "Reference stars teach it; without "
-        "them, rolls share a pattern of unknown values.", {"systematics": "patterns"},
+        "them, rolls share a pattern of unknown values.", {"pattern": "patterns"},
         f"after [learning it]({_PATTERN}) from other stars (`pyklip-diffrender learn`)",
         "Higher limits near the star than with a pattern. A single roll usually ends as "
         "`MODEL_MISMATCH`.",

@@ -2,7 +2,7 @@
 
     python examples/hip65426_pyklip.py CALINTS OPD [--output FOLDER]
 
-CALINTS is a NIRCam F444W file of one roll, OPD the wavefront map measured nearest in time. The
+CALINTS is a NIRCam F444W file of one roll, OPD the map measured nearest in time. The
 script writes what pyKLIP writes, maps and tables of companion candidates, and a figure.
 """
 
@@ -26,7 +26,7 @@ COMPANION_RADIUS = 0.35  # arcsec; what is left out of the figure of merit
 def reduce(frames: Path, opd: Path, folder: Path) -> Refinement:
     """Run pyKLIP with algo="diffrender"; returns the fit behind the subtraction."""
     folder.mkdir(parents=True, exist_ok=True)
-    with dr.backend(opd=opd):
+    with dr.pyklip_backend.backend(opd=opd):
         dataset = JWSTData([str(frames)], None, highpass=False)
         klip_dataset(
             dataset,

@@ -1,7 +1,7 @@
 """A visit as the archive delivers it, made with the package's own model.
 
 Two rolls of a target with two planets, five small-grid dithers of a reference star, F356W and
-F444W behind MASK430R, an association file for each filter, and a wavefront map two days older. Run
+F444W behind MASK430R, an association file for each filter, and an OPD map two days older. Run
 from the root of the project::
 
     python examples/visit.py visit
@@ -13,6 +13,7 @@ and a flat field with an error of 1 % in every pixel. Nothing of it is from the 
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -59,10 +60,10 @@ def make_visit(folder: str | Path) -> Path:
     """Write the files into a folder, and the map into its folder ``maps``."""
     folder = Path(folder)
     (folder / "maps").mkdir(parents=True)
-    measured = dr.random_opd(1, npix=SAMPLES)
+    measured = dr.wavefront.random_opd(1, npix=SAMPLES)
     card = fits.Header({"BUNIT": "m"})
     fits.PrimaryHDU(measured.data, card).writeto(folder / "maps" / "opd_2026-02-01.fits")
-    wavefront = measured.data + dr.random_opd(2, npix=SAMPLES, rms=6e-9).data
+    wavefront = measured.data + dr.wavefront.random_opd(2, npix=SAMPLES, rms=6e-9).data
     for band in FILTERS:
         _Band(folder, band, wavefront).write()
     return folder
@@ -109,7 +110,7 @@ class _Band:
     ) -> dict[str, str]:
         """Write a file; the member of an association that names it."""
         seed = 10 * observation + exposure
-        drift = dr.random_opd(seed, npix=SAMPLES, rms=1e-9).data
+        drift = dr.wavefront.random_opd(seed, npix=SAMPLES, rms=1e-9).data
         opd = torch.from_numpy(self.wavefront + drift)
 
         def image(x: float, y: float) -> NDArray[np.float64]:
@@ -135,4 +136,6 @@ class _Band:
 
 
 if __name__ == "__main__":
-    make_visit(sys.argv[1])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="where the files are written")
+    make_visit(parser.parse_args().folder)

@@ -1,7 +1,8 @@
 """Differentiable rendering of a star behind a coronagraph, as an algorithm for pyKLIP.
 
-Every public name is loaded when it is first used, so that ``import pyklip_diffrender`` and
-``pyklip-diffrender --help`` wait neither for PyTorch nor for pyKLIP.
+The names that most scripts need are here; all others are in the packages, such as
+``dr.detection.fit_disk``. Each name is loaded when it is first used, so that ``import
+pyklip_diffrender`` and ``pyklip-diffrender --help`` wait neither for PyTorch nor for pyKLIP.
 """
 
 from __future__ import annotations
@@ -12,60 +13,29 @@ from typing import TYPE_CHECKING, Any
 from pyklip_diffrender._version import __version__
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.archive import fetch_calints, list_calints
+    from pyklip_diffrender.archive import fetch_calints
     from pyklip_diffrender.bridges import from_poppy, from_webbpsf
-    from pyklip_diffrender.detection import (
-        Combination,
-        Detection,
-        Disk,
-        WideField,
-        combine,
-        completeness,
-        detect,
-        fit_disk,
-        wide_field,
-    )
+    from pyklip_diffrender.detection import Combination, Detection, combine, detect
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.instrument.spectrum import star_flux_density
-    from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.pattern import (
-        PatternLibrary,
-        combine_libraries,
-        known_systematics,
-        learn_library,
-        learn_systematics,
-    )
-    from pyklip_diffrender.pyklip_backend import (
-        DiffrenderSettings,
-        backend,
-        observation_from_dataset,
-        register,
-        unregister,
-    )
+    from pyklip_diffrender.pattern import PatternLibrary, known_pattern, learn_pattern
+    from pyklip_diffrender.pyklip_backend import register
     from pyklip_diffrender.reduction import Reduction, reduce
-    from pyklip_diffrender.refinement import (
-        GaussNewton,
-        Refinement,
-        Status,
-        refine,
-    )
+    from pyklip_diffrender.refinement import FitSettings, Refinement, Status, refine
+    from pyklip_diffrender.scene.detector_pattern import DetectorPattern
     from pyklip_diffrender.scene.objects import Planet, Scene, Star
     from pyklip_diffrender.scene.observation import Observation
-    from pyklip_diffrender.scene.sequence import Sequence
+    from pyklip_diffrender.scene.sequence import ExposureSequence
     from pyklip_diffrender.scene.simulation import model_for, simulate
-    from pyklip_diffrender.scene.systematics import Systematics
     from pyklip_diffrender.surveys import survey
-    from pyklip_diffrender.wavefront.opd import choose_map, random_opd, read_opd
-    from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
+    from pyklip_diffrender.wavefront.opd import choose_opd, read_opd
 
 __all__ = [
     "Combination",
     "Detection",
-    "DiffrenderSettings",
-    "Disk",
-    "GaussNewton",
-    "LinearModel",
+    "DetectorPattern",
+    "ExposureSequence",
+    "FitSettings",
     "Observation",
     "OpticalSystem",
     "PatternLibrary",
@@ -73,68 +43,49 @@ __all__ = [
     "Reduction",
     "Refinement",
     "Scene",
-    "Sequence",
     "Star",
     "Status",
-    "Systematics",
-    "WavefrontPrior",
-    "WideField",
     "__version__",
-    "backend",
-    "choose_map",
+    "choose_opd",
     "combine",
-    "combine_libraries",
-    "completeness",
     "detect",
     "fetch_calints",
-    "fit_disk",
     "from_poppy",
     "from_webbpsf",
-    "known_systematics",
-    "learn_library",
-    "learn_prior",
-    "learn_systematics",
-    "list_calints",
+    "known_pattern",
+    "learn_pattern",
     "model_for",
     "nircam_coronagraph",
-    "observation_from_dataset",
-    "random_opd",
     "read_opd",
     "reduce",
     "refine",
     "register",
     "simulate",
-    "star_flux_density",
     "survey",
-    "unregister",
-    "wide_field",
 ]
 
 _NAMES = {
-    "archive": "fetch_calints list_calints",
+    "archive": "fetch_calints",
     "bridges": "from_poppy from_webbpsf",
-    "detection": "Combination combine completeness detect Detection Disk fit_disk "
-    "wide_field WideField",
+    "detection": "Combination combine detect Detection",
     "instrument.nircam": "nircam_coronagraph",
-    "instrument.spectrum": "star_flux_density",
-    "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",
-    "pyklip_backend": "backend DiffrenderSettings observation_from_dataset register unregister",
+    "pattern": "known_pattern learn_pattern PatternLibrary",
+    "pyklip_backend": "register",
     "reduction": "reduce Reduction",
-    "pattern": "combine_libraries known_systematics learn_library learn_systematics PatternLibrary",
-    "refinement": "GaussNewton refine Refinement Status",
+    "refinement": "FitSettings refine Refinement Status",
+    "scene.detector_pattern": "DetectorPattern",
     "scene.objects": "Planet Scene Star",
     "scene.observation": "Observation",
+    "scene.sequence": "ExposureSequence",
     "scene.simulation": "model_for simulate",
-    "scene.sequence": "Sequence",
-    "scene.systematics": "Systematics",
-    "wavefront.opd": "choose_map random_opd read_opd",
     "surveys": "survey",
-    "wavefront.priors": "learn_prior WavefrontPrior",
+    "wavefront.opd": "choose_opd read_opd",
 }
 """Public names by the module they are in."""
 
 _SUBMODULES = (
+    "archive",
     "bridges",
     "detection",
     "drawing",
@@ -145,6 +96,7 @@ _SUBMODULES = (
     "optics",
     "parameters",
     "pattern",
+    "pyklip_backend",
     "reduction",
     "refinement",
     "scene",

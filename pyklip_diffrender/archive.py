@@ -21,7 +21,7 @@ from pyklip_diffrender.io.progress import ProgressBar
 
 _TOKEN = "MAST_API_TOKEN"
 
-_UNKNOWN = -1
+_SIZE_NOT_STATED = -1
 """Size of a file for which the archive states none."""
 
 
@@ -89,7 +89,7 @@ def list_calints(
     This needs a network:
 
     >>> import pyklip_diffrender as dr
-    >>> print(dr.list_calints(1184, "G-7-34", filter="F444W"))  # doctest: +SKIP
+    >>> print(dr.archive.list_calints(1184, "G-7-34", filter="F444W"))  # doctest: +SKIP
     """
     mast = _mast()
     try:
@@ -128,7 +128,7 @@ def fetch_calints(
     folder: str | os.PathLike[str] | None = None,
     progress: bool = False,
 ) -> list[Path]:
-    """Fetch the calints files of a programme from MAST, for `reduce` or `Sequence.from_files`.
+    """Fetch the calints files of a programme from MAST, for `reduce` or `ExposureSequence`.
 
     Needs the extra ``archive`` (astroquery) and a network. Files of reference stars come along
     where the archive associates them with the target. Proprietary files need a token of MAST in the
@@ -205,7 +205,7 @@ def _download(mast: _Mast, row: Any, path: Path) -> None:
         if status != "COMPLETE":
             raise ArchiveError(f"{path.name} was not fetched ({message or status})")
         size, expected = temporary.stat().st_size, row["bytes"]
-        if expected == _UNKNOWN:
+        if expected == _SIZE_NOT_STATED:
             with open_fits(temporary):  # Raises an exception for a part of a file.
                 pass
         elif size != expected:
@@ -277,9 +277,9 @@ def _listing(products: Table, folder: Path) -> QTable:
                 f"MAST lists a product called {name!r}, expected the name of a file without a "
                 "folder. Report it to the archive, and download the files that you need by hand"
             )
-    sizes = np.ma.filled(np.ma.asarray(products["size"]), _UNKNOWN).astype(np.int64)
+    sizes = np.ma.filled(np.ma.asarray(products["size"]), _SIZE_NOT_STATED).astype(np.int64)
     complete = [
-        (folder / name).is_file() and size in (_UNKNOWN, (folder / name).stat().st_size)
+        (folder / name).is_file() and size in (_SIZE_NOT_STATED, (folder / name).stat().st_size)
         for name, size in zip(names, sizes, strict=True)
     ]
     listing = QTable(

@@ -51,7 +51,7 @@ class IncompatibleSetupError(DiffrenderError, ValueError):
 
 
 class MissingOPDError(DiffrenderError, ValueError):
-    """A reduction was requested without a starting wavefront map."""
+    """A reduction was requested without a starting OPD map."""
 
 
 class CorruptFileError(DiffrenderError, OSError):

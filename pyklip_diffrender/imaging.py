@@ -6,7 +6,8 @@ a point source with its side lobes, which behind a Lyot stop have most of its li
 model of the fit knows the covariance Sigma of the rest: noise, errors of the flat field, which
 rolls share, and all that the wavefront, the flux and the alignment of the star may still be. The
 prior is a = T u, point sources anywhere: u is white noise of unit variance, and T is such that
-a source of one standard deviation has a S/N of `_STRENGTH`. With B = P * H T, the posterior mean is
+a source of one standard deviation has a S/N of `_PRIOR_SOURCE_SNR`. With B = P * H T, the posterior
+mean is
 
     a = T u,    (1 + B^T Sigma^-1 B) u = B^T Sigma^-1 (d - star),
 
@@ -76,41 +77,41 @@ Image = NDArray[np.float64]
 Light = Sequence[Mapping[int, Tensor]]
 """Images (k, ny, nx) by frame, for every fit."""
 
-_STRENGTH = 0.8
+_PRIOR_SOURCE_SNR = 0.8
 """S/N of a source of one standard deviation of the prior. With less, the image is deeper and not as
 sharp, in the limit a matched filter's; with more, it is sharper and noisier."""
 
-_BEAM = 0.7
+_BEAM_FWHM_LAMBDA_D = 0.7
 """FWHM of the beam, lambda/D. With what the prior blurs, a point source has 1.3 to 1.4 lambda/D, as
 in the frames."""
 
-_REACH = 10.0
+_SOURCE_REACH_LAMBDA_D = 10.0
 """lambda/D from the middle of a point source's image to where it is cut."""
 
-_MARGIN = 1.45
+_SKY_SIDE_RATIO = 1.45
 """Side of the sky over the side of the frames, which turn in it."""
 
-_SMOOTH = 2.0
+_NOISE_SMOOTHING_PIXELS = 2.0
 """Pixels over which the noise is averaged for the prior."""
 
-_TOLERANCE = 1e-3
+_GRADIENT_TOLERANCE = 1e-3
 """Relative residual at which conjugate gradients end."""
 
-_ITERATIONS = 200
+_GRADIENT_ITERATIONS = 200
 
-_STEP = 2
+_THROUGHPUT_STEP_PIXELS = 2
 """Pixels between the places at which the throughput is computed."""
 
-_APART = 6
+_COMB_STEP = 6
 """Places of one comb are this many steps apart, so far that they do not matter to each other."""
 
-_PROBES = 24
+_ERROR_PROBES = 24
 """Fields of random signs from which the error is estimated, to 3 to 10 %."""
 
-_FEW = 4
+_FEWEST_PLACES_PER_RING = 4
 """Number of places in a ring below which it takes its neighbours' value."""
 
-_BATCH = 12
+_SOLVED_AT_A_TIME = 12
 """Right-hand sides that are solved together."""
 
 
@@ -121,7 +122,7 @@ class SkyModel:
         self.groups = groups_of(fits)
         first = fits[0].frames[0]
         self.pixelscale = math.sqrt(math.prod(first.observation.pixelscale))
-        side = int(_MARGIN * max(first.observation.shape)) | 1
+        side = int(_SKY_SIDE_RATIO * max(first.observation.shape)) | 1
         # `shape` is (ny, nx), and `center` the row and column of the star. `grid` (ny, nx, 2) has
         # x, y from the star in arcsec, with y to the north and x to the west if the orientation of
         # the frames is known, else along the axes of the first frame. `pixelscale` and `resolution`
@@ -139,11 +140,11 @@ class SkyModel:
         ]  # fmt: skip
         model = first.model
         self.resolution = float(model.bandpass.mean_wavelength) / model.diameter / ARCSEC
-        reach = math.ceil(_REACH * self.resolution / self.pixelscale)
+        reach = math.ceil(_SOURCE_REACH_LAMBDA_D * self.resolution / self.pixelscale)
         self._point_sources = [self._point_source(templates, reach) for _, templates in self.groups]
-        # In white noise n, a source of peak T has a S/N of T |P| / n, so that T = `_STRENGTH` n /
-        # |P|.
-        self._prior = _STRENGTH * self._noise() / np.linalg.norm(self._point_sources[0])
+        # In white noise n, a source of peak T has a S/N of T |P| / n, so that T =
+        # `_PRIOR_SOURCE_SNR` n / |P|.
+        self._prior = _PRIOR_SOURCE_SNR * self._noise() / np.linalg.norm(self._point_sources[0])
         self._beam, self._response = self._beam_and_response()
 
     @staticmethod
@@ -157,7 +158,7 @@ class SkyModel:
 
     def _beam_and_response(self) -> tuple[Image, Image]:
         """Transforms of the beam, and of a point source in white noise as it shows it."""
-        width = _BEAM * self.resolution / self.pixelscale / math.sqrt(8 * math.log(2))
+        width = _BEAM_FWHM_LAMBDA_D * self.resolution / self.pixelscale / math.sqrt(8 * math.log(2))
         frequency = np.fft.fftfreq(self.shape[0])
         beam = np.exp(-2 * (math.pi * width) ** 2 * (frequency[:, None] ** 2 + frequency**2))
         source = self._point_sources[0]
@@ -166,7 +167,7 @@ class SkyModel:
         # keeps s^2 p / (1 + s^2 p) of each frequency. Its value in the middle is the mean over
         # frequencies, by which the beam is divided so that a peak stays 1.
         power = np.abs(np.fft.fft2(source / np.linalg.norm(source), s=self.shape)) ** 2
-        kept = _STRENGTH**2 * power / (1 + _STRENGTH**2 * power)
+        kept = _PRIOR_SOURCE_SNR**2 * power / (1 + _PRIOR_SOURCE_SNR**2 * power)
         peak = (beam * kept).mean()
         return np.asarray(beam / peak), np.asarray(beam * kept / peak)
 
@@ -187,7 +188,7 @@ class SkyModel:
             for k, matrix in matrices.items():
                 weight = linear.frames[k].weight.numpy().ravel() ** 2
                 information += np.asarray(matrix.T @ weight).reshape(self.shape)
-        information = gaussian_filter(np.maximum(information, 0.0), _SMOOTH)
+        information = gaussian_filter(np.maximum(information, 0.0), _NOISE_SMOOTHING_PIXELS)
         return np.asarray(np.maximum(information, 1e-6 * information.max()) ** -0.5)
 
     def light(self) -> Light:
@@ -241,8 +242,8 @@ class SkyModel:
         # All systems have the same matrix, and each its own lengths along its directions.
         solution, residual = np.zeros_like(right), right.copy()
         direction, size = right.copy(), norm(right)
-        enough = _TOLERANCE**2 * size
-        for _ in range(_ITERATIONS):
+        enough = _GRADIENT_TOLERANCE**2 * size
+        for _ in range(_GRADIENT_ITERATIONS):
             if (size <= enough).all():
                 break
             seen = self._collected(self._rendered(self._prior * direction))
@@ -287,7 +288,9 @@ class SkyModel:
         covered = sum(m.sum(axis=0) for part in self._onto_frames for m in part.values())
         # The prior is wide where no frame is, so that those places would hide all others.
         inside = np.asarray(covered).reshape(self.shape) > 0.5
-        signs = inside * np.random.default_rng(seed).choice([-1.0, 1.0], (_PROBES, *self.shape))
+        signs = inside * np.random.default_rng(seed).choice(
+            [-1.0, 1.0], (_ERROR_PROBES, *self.shape)
+        )
         once = self._solved(self._prior * self._seen(signs))
         covariance = self._seen(self._prior * (once - self._solved(once)))
         distance = np.hypot(*np.moveaxis(self.grid, -1, 0)) / self.resolution
@@ -304,9 +307,11 @@ class SkyModel:
         # at each other's places averages out over the median of a ring of lambda/D.
         first = self.groups[0][1].origin
         ny, nx = first.observation.shape
-        rows, columns = (np.arange(0, n, _STEP) for n in (ny, nx))
+        rows, columns = (np.arange(0, n, _THROUGHPUT_STEP_PIXELS) for n in (ny, nx))
         y, x = (each.ravel() for each in np.meshgrid(rows, columns, indexing="ij"))
-        comb = (y // _STEP % _APART) * _APART + x // _STEP % _APART
+        comb = (
+            y // _THROUGHPUT_STEP_PIXELS % _COMB_STEP
+        ) * _COMB_STEP + x // _THROUGHPUT_STEP_PIXELS % _COMB_STEP
         signs = np.random.default_rng(seed).choice([-1.0, 1.0], len(y))
         kept = np.full(len(y), np.nan)
         angle = first.observation.position_angle
@@ -351,12 +356,12 @@ def _convolved(images: Image, kernel: Image) -> Image:
 def _by_ring(values: Image, at: Image, distance: Image) -> Image:
     """Medians of values in rings of width 1 at the distances `at`, interpolated to others."""
     ring = at.astype(np.int64)
-    known = [k for k in np.unique(ring) if (ring == k).sum() >= _FEW]
+    known = [k for k in np.unique(ring) if (ring == k).sum() >= _FEWEST_PLACES_PER_RING]
     medians = [float(np.median(values[ring == k])) for k in known]
     return np.asarray(np.interp(distance, np.array(known) + 0.5, medians))
 
 
 def _batches(items: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
     """Split items into parts that are solved together."""
-    for start in range(0, len(items), _BATCH):
-        yield items[start : start + _BATCH]
+    for start in range(0, len(items), _SOLVED_AT_A_TIME):
+        yield items[start : start + _SOLVED_AT_A_TIME]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from astropy import units as u
 
     from pyklip_diffrender.pattern import PatternRequest
-    from pyklip_diffrender.refinement import GaussNewton
+    from pyklip_diffrender.refinement import FitSettings
 
 # How an option is declared.
 
@@ -180,31 +180,31 @@ class SharedOptions:
             look with --quick.""",
         "metavar": "N",
     })  # fmt: skip
-    systematics: PatternRequest | str | os.PathLike[str] = field(default="auto", metadata={
+    pattern: PatternRequest | str | os.PathLike[str] = field(default="auto", metadata={
         "choices": ("auto", "references", "off"), "path": True,
-        "stated_type": 'Systematics, PatternLibrary, path, "auto", "references" or "off"',
-        "meaning": """Flat-field pattern, or a file with one (``systematics.fits``); or a library of
+        "stated_type": 'DetectorPattern, PatternLibrary, path, "auto", "references" or "off"',
+        "meaning": """Detector pattern, or a file with one (``pattern.fits``); or a library of
             patterns to search besides the package's, its file, or a folder of such files. "auto"
-            takes the pattern of the package's library (see `known_systematics`), and fits the
+            takes the pattern of the package's library (see `known_pattern`), and fits the
             reference stars only where there is none for these pixels; "references" fits them in any
             case and uses both. A fit that shows less than half of a library's pattern is repeated
             without libraries. If neither has the pattern, rolls on the same pixels are assumed to
             have one of the usual strength in common. With "off" there is no pattern.""",
         "expected": "'auto', 'references', 'off', or an existing file or folder with patterns",
-        "help": """Flat-field pattern: auto (the package's library, else the reference stars),
+        "help": """Detector pattern: auto (the package's library, else the reference stars),
             references (both), off, a folder or file of patterns to search besides the package's
-            (command learn), or a systematics.fits of an earlier reduction.""",
+            (command learn), or a pattern.fits of an earlier reduction.""",
         "metavar": "CHOICE",
     })  # fmt: skip
     references: References = field(default="joint", metadata={
         "choices": get_args(References),
         "meaning": """Use of the frames of reference stars. With "joint" frames of the target's
             epoch are fitted together with the target's, in one likelihood, if that makes the limits
-            deeper, and frames of other epochs teach the flat-field pattern where the library has
+            deeper, and frames of other epochs teach the detector pattern where the library has
             none; with "pattern" all of them do; with "off" they are not used. With `disk`, "joint"
             stands for "pattern".""",
         "help": """Use of the frames of reference stars: in one likelihood with the target's, for
-            the flat-field pattern, or not at all.""",
+            the detector pattern, or not at all.""",
     })  # fmt: skip
     threshold: float = field(default=5.0, metadata={
         "meaning": "S/N of a candidate.", "help": "S/N of a candidate.", "metavar": "S/N",
@@ -279,7 +279,7 @@ class ReduceOptions(SharedOptions):
     UnitError, ShapeError, NonFiniteError
         For a flux density or a memory that is none.
     CorruptFileError
-        For a file or folder of `systematics` that is damaged or has no pattern.
+        For a file or folder of `pattern` that is damaged or has no pattern.
 
     Examples
     --------
@@ -288,11 +288,11 @@ class ReduceOptions(SharedOptions):
     0.45
     """
 
-    settings: GaussNewton | None = field(default=None, metadata={
-        "stated_type": "GaussNewton, optional",
+    settings: FitSettings | None = field(default=None, metadata={
+        "stated_type": "FitSettings, optional",
         "meaning": "Settings of the fits; by default as in `refine`.",
         "not_on_command_line": "an object of Python",
-        "not_in_surveys": "they have a table with the arguments of GaussNewton",
+        "not_in_surveys": "they have a table with the arguments of FitSettings",
     })  # fmt: skip
     injections: int = field(default=0, metadata={
         "meaning": """Number of planets to add to the fitted frames, slightly brighter than the
@@ -321,7 +321,7 @@ class ReduceOptions(SharedOptions):
     })  # fmt: skip
     memory: float | str | u.Quantity | None = field(default=None, metadata={
         "kind": float, "text": True, "stated_type": "float, str or Quantity, optional",
-        "meaning": """Memory that the process may take, bytes or such as "2 GB"; see `GaussNewton`,
+        "meaning": """Memory that the process may take, bytes or such as "2 GB"; see `FitSettings`,
             whose value it replaces.""",
         "help": 'Memory that the process may take, such as "2 GB"; default: as much as it needs.',
         "metavar": "SIZE", "not_in_surveys": "their memory_limit says how much a worker has",
@@ -363,7 +363,7 @@ class ReduceOptions(SharedOptions):
                 "wide, disk: got both, expected one of them: beyond the fitted pixels a disk would "
                 "be taken for point sources. Reduce the frames twice"
             )
-        object.__setattr__(self, "systematics", as_request(self.systematics))
+        object.__setattr__(self, "pattern", as_request(self.pattern))
 
     @property
     def side(self) -> int:
@@ -397,7 +397,7 @@ class ReduceKeywords(TypedDict, total=False):
     """
 
     size: int | None
-    systematics: PatternRequest | str | os.PathLike[str]
+    pattern: PatternRequest | str | os.PathLike[str]
     references: References
     threshold: float
     wide: bool
@@ -405,7 +405,7 @@ class ReduceKeywords(TypedDict, total=False):
     completeness: bool
     star_flux: float | str | u.Quantity | None
     star_flux_error: float
-    settings: GaussNewton | None
+    settings: FitSettings | None
     injections: int
     accuracy: Accuracy
     device: str

@@ -71,7 +71,7 @@ LEVELS = (
     ),
     Parameter(
         "pedestal", "", 1, 0.0, 0.0, -inf, inf, inf, "light besides the star",
-        "light per pixel that the flat-field pattern multiplies besides the star, in units of the "
+        "light per pixel that the detector pattern multiplies besides the star, in units of the "
         "image",
     ),
 )  # fmt: skip

@@ -99,7 +99,7 @@ def rng():
 
 @pytest.fixture(scope="session")
 def shared_data():
-    """Folder of real frames and wavefront maps, too large to come with the code.
+    """Folder of real frames and OPD maps, too large to come with the code.
 
     It is ``data`` in the folder named by PYKLIP_DIFFRENDER_SHARED, or in ``shared`` next to the
     project. Without either, the tests are skipped; a variable that points nowhere fails them.
@@ -111,7 +111,7 @@ def shared_data():
     if named:
         pytest.fail(f"PYKLIP_DIFFRENDER_SHARED={named}: there is no folder {data}")
     pytest.skip(
-        "needs real frames and wavefront maps: put a folder 'shared' next to the project or "
+        "needs real frames and OPD maps: put a folder 'shared' next to the project or "
         "name one in PYKLIP_DIFFRENDER_SHARED"
     )
 

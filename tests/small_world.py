@@ -98,9 +98,9 @@ class World:
         self.folder = folder
         self.map = folder / "opd.fits"
         self._frames: dict[tuple[str, str, str], list[Path]] = {}
-        opd = 0.1 * dr.random_opd(1, npix=NPIX).data
+        opd = 0.1 * dr.wavefront.random_opd(1, npix=NPIX).data
         fits.PrimaryHDU(opd, fits.Header({"BUNIT": "m"})).writeto(self.map)
-        self.opd = opd + dr.random_opd(7, npix=NPIX, rms=2e-9).data
+        self.opd = opd + dr.wavefront.random_opd(7, npix=NPIX, rms=2e-9).data
 
     def frames(self, filter_, date, star):
         """Files of a star, which are written when they are first asked for."""
@@ -230,7 +230,7 @@ class Request(NamedTuple):
     # "fitted", "flux" (a flux density in each filter) or "sed" (a file).
     star: str = "fitted"
     # "auto", "library" or "file" (one for each filter).
-    pattern: str = "auto"
+    pattern_file: str = "auto"
     spectra: tuple[str, ...] = SPECTRA
 
     @property
@@ -250,22 +250,22 @@ class Request(NamedTuple):
     def files(self):
         return [path for paths in self.frames.values() for path in paths]
 
-    def systematics(self, filter_):
+    def pattern_option(self, filter_):
         """The option for the pattern in a filter."""
-        if self.pattern == "auto":
+        if self.pattern_file == "auto":
             return {}
-        pattern = self.world.patterns_by_hand[self.pattern]
-        return {"systematics": str(pattern if self.pattern == "library" else pattern[filter_])}
+        pattern = self.world.patterns_by_hand[self.pattern_file]
+        return {"pattern": str(pattern if self.pattern_file == "library" else pattern[filter_])}
 
 
 def through_python(request, folder):
     world, made = request.world, []
-    for each in dr.Sequence.by_filter_and_epoch(request.files, target=TARGET):
-        options = request.options | request.systematics(each.filter)
+    for each in dr.ExposureSequence.by_filter_and_epoch(request.files, target=TARGET):
+        options = request.options | request.pattern_option(each.filter)
         if request.star == "flux":
             options["star_flux"] = world.star_flux[each.filter]
         if request.star == "sed":
-            options["star_flux"] = dr.star_flux_density(world.star_sed, each.filter)
+            options["star_flux"] = dr.instrument.star_flux_density(world.star_sed, each.filter)
         made.append(dr.reduce(each, world.map, size=SIZE, **options))
     combined = dr.combine(made, spectra=request.spectra).to_dict() if len(made) > 1 else None
     return Found([each.detection for each in made], list(map(summarise, made)), combined)
@@ -275,7 +275,7 @@ def through_command(request, folder):
     world = request.world
     arguments = ["reduce", *map(str, request.files), "--target", TARGET, "--opd", str(world.map)]
     arguments += ["--size", str(SIZE), "-o", str(folder)]
-    for name, value in (request.options | request.systematics(request.filters[-1])).items():
+    for name, value in (request.options | request.pattern_option(request.filters[-1])).items():
         option = OPTIONS[name]
         arguments += [option.flag] if option.is_switch else [option.flag, str(value)]
     if request.star == "flux":
@@ -304,7 +304,7 @@ def _products(folders):
 
 
 def through_klip_dataset(request, folder):
-    world, options = request.world, request.options | request.systematics(request.filters[0])
+    world, options = request.world, request.options | request.pattern_option(request.filters[0])
     if request.star == "flux":
         options["star_flux"] = world.star_flux[request.filters[0]]
     if request.star == "sed":
@@ -313,7 +313,7 @@ def through_klip_dataset(request, folder):
         options["spectra"] = request.spectra
     science, references = _by_use(request.files)
     dataset = reduce_jwst_files(
-        science, references, folder=folder, prefix="x", opd=world.map, fit_pixels=SIZE, **options
+        science, references, folder=folder, prefix="x", opd=world.map, size=SIZE, **options
     )
     made = [record.subtraction.reduction for record in dataset.diffrender_results]
     return Found([each.detection for each in made], list(map(summarise, made)))
@@ -328,7 +328,7 @@ def _by_use(files):
 
 
 def through_spaceklip(request, folder):
-    world, options = request.world, request.options | request.systematics(request.filters[0])
+    world, options = request.world, request.options | request.pattern_option(request.filters[0])
     if request.star == "flux":
         options["star_flux"] = {name: world.star_flux[name] for name in request.frames}
     if request.star == "sed":
@@ -340,7 +340,7 @@ def through_spaceklip(request, folder):
         table["TYPE"] = ["REF" if path in _by_use(files)[1] else "SCI" for path in files]
     database = StandIn(folder, tables)
     searches = spaceklip.run_obs(
-        database, opd=world.map, fit_pixels=SIZE, spectra=request.spectra, **options
+        database, opd=world.map, size=SIZE, spectra=request.spectra, **options
     )
     combined = None
     for path in folder.rglob("combined.fits"):
@@ -352,7 +352,7 @@ def through_spaceklip(request, folder):
 def through_a_survey(request, folder):
     world, sequences = request.world, []
     for name, files in request.frames.items():
-        options = request.options | request.systematics(name)
+        options = request.options | request.pattern_option(name)
         if "injections" in options:
             options["injections"] = {"contrasts": [4e-5], "separations": [0.6], "angles": [300.0]}
         if request.star == "flux":

@@ -59,7 +59,7 @@ def as_before(sequence):
 
 
 def test_the_table_says_what_every_file_is(folder):
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert as_before(sequence)
     assert sequence.excluded == ()
     table = sequence.table
@@ -75,7 +75,7 @@ def test_the_table_says_what_every_file_is(folder):
     assert [each.reference for each in sequence.references] == [True]
     assert sequence.science[1].roll_from(sequence.science[0]) == pytest.approx(-10)
     assert sequence.cutout(10).science[0].shape == (10, 10)
-    chosen = dr.Sequence.from_files(folder, target="hd 2")
+    chosen = dr.ExposureSequence.from_files(folder, target="hd 2")
     assert [each.name for each in chosen.science] == [THIRD]
     assert len(chosen.references) == 2
 
@@ -114,7 +114,7 @@ EXCLUDED = [
 def test_what_is_no_frame_of_this_setup_is_excluded(folder):
     for k, (name, cards, _) in enumerate(EXCLUDED):
         calints(folder / name, observation=1 if "nrcalong" in name else 9 + k, cards=cards)
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert as_before(sequence)
     said = reasons(sequence)
     assert said.keys() == {name for name, _, _ in EXCLUDED}
@@ -123,18 +123,20 @@ def test_what_is_no_frame_of_this_setup_is_excluded(folder):
 
 
 @pytest.mark.parametrize("name", ["PRIMARY", "RESULT_PHASE"])
-def test_a_wavefront_map_is_no_frame(tmp_path, name):
+def test_an_opd_map_is_no_frame(tmp_path, name):
     """In the wrong place on the command line, and in the folder of the frames."""
     image = fits.ImageHDU(np.zeros((16, 16)), fits.Header({"BUNIT": "um"}), name=name)
     if name == "PRIMARY":
         image.writeto(tmp_path / "opd.fits")
     else:
         fits.HDUList([fits.PrimaryHDU(), image]).writeto(tmp_path / "opd.fits")
-    words = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd"
+    words = "it is an OPD map, no frame of a star; OPD maps are given as opd"
     with pytest.raises(NoValidPixelsError, match=words):
-        dr.Sequence.from_files(tmp_path)
+        dr.ExposureSequence.from_files(tmp_path)
     calints(tmp_path / "a.fits")
-    assert reasons(dr.Sequence.from_files(tmp_path))["opd.fits"].startswith("it is a wavefront map")
+    assert reasons(dr.ExposureSequence.from_files(tmp_path))["opd.fits"].startswith(
+        "it is an OPD map"
+    )
 
 
 def test_one_exposure_is_used_once(folder):
@@ -146,7 +148,7 @@ def test_one_exposure_is_used_once(folder):
             hdus[name].data = hdus[name].data[0]
         hdus.writeto(folder / FIRST.replace("calints", "cal"))
     files = [*sorted(folder.iterdir()), first]
-    sequence = dr.Sequence.from_files(files)
+    sequence = dr.ExposureSequence.from_files(files)
     assert as_before(sequence)
     assert len(sequence.excluded) == 4
     assert {reason.split(" as ")[0] for _, reason in sequence.excluded} <= {
@@ -162,14 +164,14 @@ def test_of_an_exposure_the_best_file_whose_pixels_are_a_stars_is_used(folder):
         hdus.writeto(good)
     with fits.open(folder / FIRST, mode="update") as hdus:
         hdus["SCI"].data *= -1
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert uses(sequence)[good.name] == "target"
     assert "negative" in reasons(sequence)[FIRST]
 
 
 def test_what_one_filter_leaves_out_another_one_uses(folder):
     another(folder, "other.fits", cards={"FILTER": "F356W"})
-    long, short = dr.Sequence.by_filter_and_epoch(folder, target="HD 1")
+    long, short = dr.ExposureSequence.by_filter_and_epoch(folder, target="HD 1")
     assert as_before(long)
     assert [each.name for each in short.science] == ["other.fits"]
     assert reasons(long) == {"other.fits": "taken through F356W, not F444W"}
@@ -182,7 +184,7 @@ def test_a_copy_is_seen_whatever_its_header_says(folder):
         hdus["SCI"].header["ROLL_REF"] = 85.0
         hdus["SCI"].data[0, 90, 80] += 3.0
         hdus.writeto(folder / "z.fits")
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert as_before(sequence)
     assert "z.fits" in reasons(sequence)
 
@@ -194,7 +196,7 @@ def test_the_setup_of_most_of_the_targets_frames_is_reduced(folder):
     for k in (4, 5, 6):
         date = f"2022-10-03T0{9 - k}:30:00"
         another(folder, f"r{k}.fits", observation=k, roll=60.0 + k, cards=OTHER, date=date)
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     # In the order of time.
     assert [each.name for each in sequence.science] == ["r6.fits", "r5.fits", "r4.fits"]
     assert all("mask is MASK335R, not MASK430R" in reason for _, reason in sequence.excluded)
@@ -252,7 +254,7 @@ def test_a_star_with_coordinates_of_two_epochs_is_one(tmp_path, names, cards, de
         place = place_in(date, dec)
         another(tmp_path, f"{k}.fits", star=name, observation=k + 1, cards=cards | place,
                 roll=70.0 + 10 * k, date=f"2022-10-03T0{k}:00:00")  # fmt: skip
-    sequence = dr.Sequence.from_files(tmp_path)
+    sequence = dr.ExposureSequence.from_files(tmp_path)
     assert uses(sequence) == {"0.fits": "target", "1.fits": "target"}
 
 
@@ -272,7 +274,7 @@ def test_what_the_motion_does_not_explain_are_two_stars(tmp_path, names, cards, 
         place = {"TARG_RA": 100.0, "TARG_DEC": 20.0 + k * arcsec / 3600}
         another(tmp_path, f"{k}.fits", star=name, observation=k + 1, cards=cards | place)
     with pytest.raises(IncompatibleSetupError, match=r"target: the files have"):
-        dr.Sequence.from_files(tmp_path)
+        dr.ExposureSequence.from_files(tmp_path)
 
 
 def test_proper_motions_of_headers_are_compared():
@@ -311,8 +313,8 @@ def test_stars_near_each_other_or_of_nearly_one_name_are_two(tmp_path, names, ke
         another(tmp_path, f"{k}.fits", star=name, observation=k, cards=cards)
     listed = ", ".join(rf"{re.escape(name)} \(1\)" for name in names)
     with pytest.raises(IncompatibleSetupError, match=listed):
-        dr.Sequence.from_files(tmp_path)
-    sequence = dr.Sequence.from_files(tmp_path, target=names[0])
+        dr.ExposureSequence.from_files(tmp_path)
+    sequence = dr.ExposureSequence.from_files(tmp_path, target=names[0])
     assert uses(sequence) == {"0.fits": "target", "1.fits": "reference"}
 
 
@@ -325,7 +327,7 @@ def test_a_star_without_a_name_is_known_by_other_cards(folder, name, kept):
     values = {"TARGNAME": "HD 2", "TARG_RA": 101.5, "TARG_DEC": 19.0, "IS_PSF": True}
     (folder / THIRD).unlink()
     another(folder, THIRD, star="HD 2", cards=cards | {key: values[key] for key in kept})
-    sequence = dr.Sequence.from_files(folder, target="HD 1")
+    sequence = dr.ExposureSequence.from_files(folder, target="HD 1")
     assert uses(sequence)[THIRD] == "reference"
     assert as_before(sequence)
 
@@ -340,17 +342,17 @@ def test_a_reference_star_does_not_become_the_target(folder, nameless):
     else:
         truncated(folder / SECOND)
     with pytest.raises(NoValidPixelsError, match=f"only frames that are marked.*HD 2.*{FIRST}"):
-        dr.Sequence.from_files(folder)
-    assert dr.Sequence.from_files(folder, target="HD 2").target == "HD 2"
+        dr.ExposureSequence.from_files(folder)
+    assert dr.ExposureSequence.from_files(folder, target="HD 2").target == "HD 2"
 
 
 def test_a_single_star_needs_no_name(tmp_path):
     cards = dict.fromkeys((*STARS, "IS_PSF"))
     another(tmp_path, cards=cards)
-    assert dr.Sequence.from_files(tmp_path).target == "x.fits"
+    assert dr.ExposureSequence.from_files(tmp_path).target == "x.fits"
     another(tmp_path, "y.fits", observation=9, date="2022-10-03T14:00:00", cards=cards)
     with pytest.raises(NoValidPixelsError, match=r"x\.fits, y\.fits: .*does not say which star"):
-        dr.Sequence.from_files(tmp_path)
+        dr.ExposureSequence.from_files(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -388,8 +390,8 @@ def test_the_mask_is_known_by_any_of_three_cards(cards, mask):
 def test_epochs_are_separate_sequences(folder):
     another(folder, "later.fits", date="2023-12-01T13:00:00")
     with pytest.raises(IncompatibleSetupError, match=r"2022-10-03 \(jw.*2023-12-01 \(later"):
-        dr.Sequence.from_files(folder)
-    first, second = dr.Sequence.by_epoch(folder)
+        dr.ExposureSequence.from_files(folder)
+    first, second = dr.ExposureSequence.by_epoch(folder)
     assert as_before(first)
     # A reference star teaches the pattern at any epoch; the target's own planets must not.
     assert uses(second) == {
@@ -399,11 +401,11 @@ def test_epochs_are_separate_sequences(folder):
     for each, epochs in ((first, (1, 0)), (second, (0, 1))):
         assert (len(each.same_epoch), len(each.other_epochs)) == epochs
     remarks = dict(zip(second.table["file"], second.table["remark"], strict=True))
-    assert remarks[THIRD].endswith("for the flat-field pattern and KLIP only")
-    chosen = dr.Sequence.from_files(folder, epoch="2023-12-02")
+    assert remarks[THIRD].endswith("for the detector pattern and KLIP only")
+    chosen = dr.ExposureSequence.from_files(folder, epoch="2023-12-02")
     assert [each.name for each in chosen.science] == ["later.fits"]
     with pytest.raises(IncompatibleSetupError, match="epoch: got 2023-02-01, expected one of"):
-        dr.Sequence.from_files(folder, epoch="2023-02-01")
+        dr.ExposureSequence.from_files(folder, epoch="2023-02-01")
 
 
 def simulated(**details):
@@ -472,7 +474,7 @@ def subtracted(arrays):
 )
 def test_frames_whose_pixels_contradict_the_others_are_excluded(folder, light, change, words):
     another(folder, light=light, change=change)
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert re.search(words, reasons(sequence)["x.fits"])
     assert as_before(sequence)
 
@@ -481,7 +483,7 @@ def test_of_two_frames_that_differ_in_brightness_none_is_right(folder):
     (folder / SECOND).unlink()
     another(folder, SECOND, change=times(SCI=2.5, ERR=2.5))
     with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND} contradict each other"):
-        dr.Sequence.from_files(folder)
+        dr.ExposureSequence.from_files(folder)
 
 
 def aligned_with_an_outlier(path, recorded):
@@ -501,7 +503,7 @@ def aligned_with_an_outlier(path, recorded):
 @pytest.mark.parametrize("recorded", [False, True])
 def test_a_frame_with_errors_that_ring_is_left_out_and_the_others_go_on(folder, recorded):
     aligned_with_an_outlier(folder / SECOND, recorded)
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert [each.name for each in sequence.science] == [FIRST]
     ((name, reason),) = sequence.excluded
     assert name == SECOND
@@ -512,7 +514,7 @@ def test_a_frame_with_errors_that_ring_is_left_out_and_the_others_go_on(folder, 
     for other in (FIRST, THIRD):
         (folder / other).unlink()
     with pytest.raises(NoValidPixelsError, match=f"{SECOND}: .* valid"):
-        dr.Sequence.from_files(folder)
+        dr.ExposureSequence.from_files(folder)
 
 
 def test_a_frame_without_valid_pixels_about_the_star_is_left_out(folder):
@@ -523,7 +525,7 @@ def test_a_frame_without_valid_pixels_about_the_star_is_left_out(folder):
 
     another(folder, change=change)
     another(folder, "y.fits", date="2022-10-03T14:00:00", observation=9, cards={"CRPIX1": 400.0})
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert as_before(sequence)
     # 64 % of a circle of 2 arcsec are more than 1.2 arcsec from its middle.
     assert reasons(sequence)["x.fits"].startswith("64% of the pixels within 2 arcsec of the star")
@@ -533,10 +535,10 @@ def test_a_frame_without_valid_pixels_about_the_star_is_left_out(folder):
 def test_what_too_few_pixels_leave_open_is_said(tmp_path):
     small = starlight()[78:105, 75:102]
     path = calints(tmp_path / "small.fits", light=small, cards={"CRPIX1": 14.0, "CRPIX2": 14.0})
-    (frame,) = dr.Sequence.from_files(path).science
+    (frame,) = dr.ExposureSequence.from_files(path).science
     assert "1.2 arcsec from the star: whether a star is there" in frame.remarks[0]
     whole = calints(tmp_path / "whole.fits")
-    assert dr.Sequence.from_files(whole).science[0].remarks == ()
+    assert dr.ExposureSequence.from_files(whole).science[0].remarks == ()
 
 
 def test_a_pixel_that_is_missing_at_the_peak_moves_nothing(shared_data, tmp_path):
@@ -547,7 +549,7 @@ def test_a_pixel_that_is_missing_at_the_peak_moves_nothing(shared_data, tmp_path
                 data = hdus["SCI"].data
                 data[np.unravel_index(np.nanargmax(data), data.shape)] = np.nan
             hdus.writeto(tmp_path / name)
-    sequence = dr.Sequence.from_files(tmp_path, target="G 7-34")
+    sequence = dr.ExposureSequence.from_files(tmp_path, target="G 7-34")
     assert not sequence.excluded
     assert len(sequence.science) == 2
 
@@ -558,7 +560,7 @@ def test_stars_a_few_pixels_from_their_stated_places_and_in_a_nebula_are_admitte
     lights = (starlight((-3.0, 0.0)), starlight((3.0, 0.0)), starlight() + nebula)
     for k, light in enumerate(lights, 10):
         another(folder, f"x{k}.fits", observation=k, light=light)
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert reasons(sequence) == {}
     assert [uses(sequence)[f"x{k}.fits"] for k in (10, 11, 12)] == ["target"] * 3
 
@@ -569,7 +571,7 @@ def test_nothing_usable_is_an_error_with_every_reason_once(folder):
         fits.setval(path, "EXP_TYPE", value="NRC_TACQ")
     names = ", ".join(path.name for path in paths)
     with pytest.raises(NoValidPixelsError) as raised:
-        dr.Sequence.from_files(folder)
+        dr.ExposureSequence.from_files(folder)
     assert str(raised.value).startswith(f"none of 3 files can be used: {names}: ")
     assert str(raised.value).count("NRC_TACQ") == 1
     for k in range(2):
@@ -579,16 +581,16 @@ def test_nothing_usable_is_an_error_with_every_reason_once(folder):
         ([folder / "z0.fits"], r"the file cannot be used: z0.fits: .*NRC_TACQ"),
     ):
         with pytest.raises(NoValidPixelsError, match=words):
-            dr.Sequence.from_files(files)
+            dr.ExposureSequence.from_files(files)
 
 
 def test_real_frames_are_admitted(shared_data):
     paths = sorted((shared_data / "gto1184").glob("*_03107_*"))
     other = next((shared_data / "gto1184").glob("*_03106_*"))
-    sequence = dr.Sequence.from_files([*paths, other], filter="F356W", target="AU Mic")
+    sequence = dr.ExposureSequence.from_files([*paths, other], filter="F356W", target="AU Mic")
     assert [len(sequence.science), len(sequence.references)] == [2, 4]
     assert {reason for _, reason in sequence.excluded} == {"taken through F444W, not F356W"}
-    single = dr.Sequence.from_files(shared_data / "hip65426_f444w_calints.fits.gz")
+    single = dr.ExposureSequence.from_files(shared_data / "hip65426_f444w_calints.fits.gz")
     assert len(single.science) == 1
 
 
@@ -674,7 +676,7 @@ def test_every_integration_can_keep_its_place(tmp_path):
 def star_at(place):
     """A source behind the mask, or beside it, on 161 x 161 pixels."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=256, fov_pixels=161)
-    return model(dr.random_opd(3, npix=256), place).double().detach().numpy()
+    return model(dr.wavefront.random_opd(3, npix=256), place).double().detach().numpy()
 
 
 def neighbour(contrast, separation, angle, size=0.0):
@@ -747,7 +749,9 @@ SLOW = pytest.mark.slow
     ids=["1e-3", "1e-2", "0.1", "close", "far", "galaxy", "300 field stars", "disk of AU Mic"],
 )
 def test_neighbours_and_extended_light_are_not_taken_for_the_star(shared_data, tmp_path, change):
-    (frame,) = dr.Sequence.from_files(real_roll(shared_data, tmp_path / "a.fits", change)).science
+    (frame,) = dr.ExposureSequence.from_files(
+        real_roll(shared_data, tmp_path / "a.fits", change)
+    ).science
     assert frame.first_pixel == (490, 1500)
 
 
@@ -766,8 +770,8 @@ def test_a_star_off_the_mask_is_refused_unless_the_user_insists(shared_data, tmp
     with pytest.raises(
         NoValidPixelsError, match=r"a\.fits: its light is centred 1\.5.*with the.*star"
     ):
-        dr.Sequence.from_files(path)
-    (frame,) = dr.Sequence.from_files(path, star=(150.0, 174.5)).science
+        dr.ExposureSequence.from_files(path)
+    (frame,) = dr.ExposureSequence.from_files(path, star=(150.0, 174.5)).science
     # The whole pixels of the alignment are undone.
     assert np.abs((frame.center[0] - (150.0, 174.5) + 0.5) % 1 - 0.5).max() < 0.6
 
@@ -778,15 +782,15 @@ def test_a_place_of_the_star_is_in_its_frames(shared_data, caplog):
     for place in ((400.0, 10.0), (-5.0, 150.0), (150.0, 320.0)):
         words = rf"star: got x, y = {place[0]:g}, {place[1]:g}, expected a place in its 320 x 320"
         with pytest.raises(NoValidPixelsError, match=words):
-            dr.Sequence.from_files(path, star=place)
+            dr.ExposureSequence.from_files(path, star=place)
     assert "counted from 1" not in caplog.text
-    dr.Sequence.from_files(path, star=(151.0, 175.0))
+    dr.ExposureSequence.from_files(path, star=(151.0, 175.0))
     assert "counted from 1; expected pixels from 0, 150, 174" in caplog.text
 
 
 def test_a_place_of_the_star_is_two_numbers(folder):
     with pytest.raises(IncompatibleSetupError, match="star: got 'here', expected two finite"):
-        dr.Sequence.from_files(folder, star="here")
+        dr.ExposureSequence.from_files(folder, star="here")
 
 
 def without(path, name):
@@ -817,7 +821,7 @@ def test_files_that_cannot_be_used_do_not_vote(folder, facts, spoil):
         path = another(folder, name, observation=20 + k, roll=90.0 + k, **facts)
         if spoil is not None:
             spoil(path)
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert as_before(sequence)
     assert sorted(reasons(sequence)) == names
     assert all(reasons(sequence).values())
@@ -828,7 +832,7 @@ def test_frames_that_do_not_state_their_mask_are_no_measure_for_others(folder):
     path = folder / FIRST
     for key in ("CORONMSK", "APERNAME", "SUBARRAY"):
         fits.delval(path, key)
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     assert uses(sequence)[FIRST] == "target"
     (reason,) = reasons(sequence).values()
     assert "mask is MASK335R, which they do not state; add the card" in reason
@@ -836,7 +840,7 @@ def test_frames_that_do_not_state_their_mask_are_no_measure_for_others(folder):
 
 def test_segments_of_an_exposure_are_one_roll(folder):
     calints(folder / "seg2.fits", cards={"EXSEGNUM": 2}, date="2022-10-03T06:20:00", integrations=2)
-    sequence = dr.Sequence.from_files(folder)
+    sequence = dr.ExposureSequence.from_files(folder)
     first, second = sequence.science
     assert (first.count, second.count) == (3, 1)
     assert first.name == f"{FIRST} and 1 more"

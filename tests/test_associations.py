@@ -59,7 +59,7 @@ SORTED = {ROLL1: "target", ROLL2: "target", OTHER: "reference"}
 
 
 def test_science_is_the_target_and_psf_are_references(folder):
-    sequence = dr.Sequence.from_files(coronagraphic(folder / "a_asn.json"))
+    sequence = dr.ExposureSequence.from_files(coronagraphic(folder / "a_asn.json"))
     assert uses(sequence) == {**SORTED, ACQUISITION: "excluded"}
     assert dict(sequence.excluded)[ACQUISITION] == (
         "a_asn.json has it as target_acquisition, neither science nor psf"
@@ -72,20 +72,20 @@ def test_an_association_counts_more_than_headers(folder):
         (folder / name).unlink()
         calints(folder / name, star, observation=observation, cards={"IS_PSF": star == "HD 1"},
                 date=f"2022-10-03T0{observation}:00:00")  # fmt: skip
-    assert uses(dr.Sequence.from_files([coronagraphic(folder / "a_asn.json")])) == {
+    assert uses(dr.ExposureSequence.from_files([coronagraphic(folder / "a_asn.json")])) == {
         **SORTED, ACQUISITION: "excluded",
     }  # fmt: skip
     # Of an association with one type of members it is not known whether they are a target's.
     association(folder / "b_asn.json", (ROLL1, "science"), (OTHER, "science"), kind="image2")
-    assert dr.Sequence.from_files(folder / "b_asn.json").target == "HD 2"
+    assert dr.ExposureSequence.from_files(folder / "b_asn.json").target == "HD 2"
 
 
 def test_of_associations_that_disagree_headers_decide(folder):
     coronagraphic(folder / "a_asn.json")
     association(folder / "b_asn.json", (OTHER, "science"), (ROLL1, "psf"), (ROLL2, "psf"))
     both = [folder / "a_asn.json", folder / "b_asn.json"]
-    assert dr.Sequence.from_files(both, target="HD 2").target == "HD 2"
-    again = dr.Sequence.from_files([folder / "a_asn.json", folder / "a_asn.json"])
+    assert dr.ExposureSequence.from_files(both, target="HD 2").target == "HD 2"
+    again = dr.ExposureSequence.from_files([folder / "a_asn.json", folder / "a_asn.json"])
     assert uses(again) == {**SORTED, ACQUISITION: "excluded"}
 
 
@@ -98,7 +98,10 @@ def test_members_are_beside_the_association_and_may_be_packed(folder, tmp_path, 
         *((f"../frames/{name}", kind) for name, kind in ((ROLL1, "SCIENCE"), (OTHER, "psf"))),
     )
     monkeypatch.chdir("/")
-    assert uses(dr.Sequence.from_files(path)) == {ROLL1: "target", f"{OTHER}.gz": "reference"}
+    assert uses(dr.ExposureSequence.from_files(path)) == {
+        ROLL1: "target",
+        f"{OTHER}.gz": "reference",
+    }
 
 
 def test_missing_members_are_named(folder):
@@ -106,7 +109,7 @@ def test_missing_members_are_named(folder):
     for name in (ROLL2, OTHER):
         (folder / name).unlink()
     with pytest.raises(CorruptFileError, match=f"2 of its 3 members.*: {ROLL2}, {OTHER}. Put"):
-        dr.Sequence.from_files(path)
+        dr.ExposureSequence.from_files(path)
 
 
 @pytest.mark.parametrize(
@@ -115,24 +118,24 @@ def test_missing_members_are_named(folder):
 )  # fmt: skip
 def test_what_is_no_association_is_left_out(folder, text):
     (folder / "odd.json").write_text(text, encoding="utf-8")
-    sequence = dr.Sequence.from_files([folder, folder / "odd.json"], target="HD 1")
+    sequence = dr.ExposureSequence.from_files([folder, folder / "odd.json"], target="HD 1")
     assert uses(sequence) == {**SORTED, "odd.json": "excluded"}
     with pytest.raises(NoValidPixelsError, match="no association file"):
-        dr.Sequence.from_files(folder / "odd.json")
+        dr.ExposureSequence.from_files(folder / "odd.json")
 
 
 def test_associations_in_a_folder_are_not_read(folder, caplog):
     caplog.set_level("INFO")
-    before = uses(dr.Sequence.from_files(folder, target="HD 1"))
+    before = uses(dr.ExposureSequence.from_files(folder, target="HD 1"))
     association(folder / "a_asn.json", ("gone.fits", "science"), (ROLL1, "psf"))
     assert "association" not in caplog.text
-    assert uses(dr.Sequence.from_files(folder, target="HD 1")) == before == SORTED
+    assert uses(dr.ExposureSequence.from_files(folder, target="HD 1")) == before == SORTED
     assert "its association files are not read" in caplog.text
 
 
 def test_patterns_of_names(folder, tmp_path):
     def found(pattern, **choice):
-        return set(uses(dr.Sequence.from_files(pattern, **choice)))
+        return set(uses(dr.ExposureSequence.from_files(pattern, **choice)))
 
     assert found(str(folder / "*00[12]001_*_calints.fits")) == {ROLL1, ROLL2}
     assert found([f"{tmp_path}/**/*_calints.fits"], target="HD 1") == set(SORTED)
@@ -145,7 +148,7 @@ def test_patterns_of_names(folder, tmp_path):
     calints(folder / "1.fits")
     assert found(str(folder / "[12].fits")) == {"[12].fits"}
     with pytest.raises(NoValidPixelsError, match=r"no\*\.fits: no file has a name of this pattern"):
-        dr.Sequence.from_files(folder / "no*.fits")
+        dr.ExposureSequence.from_files(folder / "no*.fits")
 
 
 def test_a_survey_takes_patterns_and_associations(tmp_path, folder):

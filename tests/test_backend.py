@@ -49,7 +49,7 @@ from pyklip_diffrender.pyklip_backend import (
     register,
     unregister,
 )
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import FitSettings
 
 PRODUCT = "x-KLmodes-all.fits"
 
@@ -393,8 +393,11 @@ MISTAKEN = [
     ({"model_options": {"npx": 64}}, "npx: not known to nircam_coronagraph, which has .*npix"),
     ({"model_options": 64}, "model_options: got a int, expected a dict"),
     ({"accuracy": "fast"}, "accuracy: got 'fast', expected one of full, quick"),
-    ({"accuracy": "quick", "fit": GaussNewton()}, "accuracy, fit: got 'quick' and settings"),
-    ({"systematics": "maybe"}, "'maybe', expected 'auto', 'references'"),
+    (
+        {"accuracy": "quick", "settings": FitSettings()},
+        "accuracy, settings: got 'quick' and settings",
+    ),
+    ({"pattern": "maybe"}, "'maybe', expected 'auto', 'references'"),
     ({"references": "none"}, "references: got 'none', expected one of joint, pattern, off"),
     ({"max_chi2": -1.0}, "max_chi2: got -1.0"),
     ({"threshold": "high"}, "threshold: got 'high', expected a positive number"),
@@ -402,10 +405,10 @@ MISTAKEN = [
     ({"image": "sharp"}, "image: got 'sharp'"),
     ({"keep_detected": "yes"}, "keep_detected: got 'yes', expected one of True, False"),
     ({"disk": 2}, "disk: got 2, expected true or false"),
-    ({"fit_pixels": 4}, "fit_pixels: got 4, expected a whole number of pixels, 8 or more"),
+    ({"size": 4}, "size: got 4, expected a whole number of pixels, 8 or more"),
     ({"star_flux": "7.2 mag"}, "star_flux: got '7.2 mag'"),
     ({"star_flux_error": 5}, "star_flux_error: got 5, expected a relative error of at most 1"),
-    ({"fit": {"cycles": 8}}, "fit: got a dict, expected a GaussNewton"),
+    ({"settings": {"cycles": 8}}, "settings: got a dict, expected a FitSettings"),
     ({"start": [1.0]}, "start: got a list, expected a dict"),
 ]
 

@@ -154,7 +154,7 @@ def test_products_are_aligned_as_pyklip_aligns_and_keep_its_header(files, refere
 def test_companions_injected_after_reading_are_in_what_is_fitted_and_kept(files, tmp_path):
     dataset = JWSTData(files)
     copied = copy.deepcopy(dataset)
-    dataset.diffrender = pyklip_backend.DiffrenderSettings(fit_pixels=24)
+    dataset.diffrender = pyklip_backend.DiffrenderSettings(size=24)
     fakes.inject_planet(copied.input, copied.centers, 3.0, copied.wcs, 13.0, 0.0, fwhm=4.0)
     clean, _ = reduce(dataset, tmp_path / "clean", aligned_center=MIDDLE)
     image, header = reduce(copied, tmp_path / "injected", aligned_center=MIDDLE)
@@ -251,7 +251,7 @@ def test_frames_that_were_left_out_moved_or_filtered_after_reading(files):
 
 
 def test_names_that_headers_cannot_hold(files, tmp_path):
-    """Frames and wavefront map are called with letters that FITS does not have."""
+    """Frames and OPD map are called with letters that FITS does not have."""
     named = [
         str(Path(path).rename(tmp_path / f"β Pic größe {k}_calints.fits"))
         for k, path in enumerate(files)

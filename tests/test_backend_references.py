@@ -197,7 +197,7 @@ def test_the_files_of_the_library_reach_the_fit(files, tmp_path, monkeypatch, ca
         seen.append(context["references"])
         context["tell"]("at work")
         subtraction = render(observation, opd, settings)
-        return replace(subtraction, systematics="references (REF)", references=2)
+        return replace(subtraction, pattern="references (REF)", references=2)
 
     in_place_of_fits(monkeypatch, subtract)
     unregister()
@@ -206,7 +206,7 @@ def test_the_files_of_the_library_reach_the_fit(files, tmp_path, monkeypatch, ca
     header = reduce(dataset, tmp_path / "out")
     ((used,), *_) = seen
     assert (used.name, used.target, used.reference) == (Path(files[2]).name, "REF", True)
-    assert (header["DRSYST"], header["DRREFS"]) == ("references (REF)", 2)
+    assert (header["DRPATTRN"], header["DRREFS"]) == ("references (REF)", 2)
     assert "at work" not in capsys.readouterr().out
     reduce(dataset, tmp_path / "out", mode="ADI", verbose=True)
     assert seen[1] == ()
@@ -220,7 +220,7 @@ def test_references_that_are_asked_for_must_be_there():
         [light, light], np.ones((2, 32, 32)), pixelscale=0.0624, filter="F444W",
         header=fits.Header({"TARGPROP": "TARGET", "INSTRUME": "NIRCAM"}), first_pixel=(0, 0),
     )  # fmt: skip
-    settings = DiffrenderSettings(systematics="references", model=model)
+    settings = DiffrenderSettings(pattern="references", model=model)
     with pytest.raises(IncompatibleSetupError, match=r"psflib_filepaths after register\(\)"):
         subtract_by_refinement(frame, OPD, settings)
 

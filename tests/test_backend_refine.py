@@ -25,11 +25,11 @@ from pyklip_diffrender.pyklip_backend import (
     subtract_by_refinement,
 )
 from pyklip_diffrender.pyklip_backend.output_files import on_product, throughput_map
-from pyklip_diffrender.refinement import GaussNewton, refine
+from pyklip_diffrender.refinement import FitSettings, refine
 from pyklip_diffrender.scene.aligned_frames import shift_frames
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation, Window
-from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
@@ -38,7 +38,7 @@ PAD = 6
 ANGLES = (0.0, 90.0)
 FLUX, CONTRAST, SEPARATION = 1e10, 4e-5, 0.8
 SKY = 100.0
-ALIGNED = GaussNewton(free=("flux", "background"), wavefront=False)
+ALIGNED = FitSettings(free=("flux", "background"), wavefront=False)
 NUMERICS = {"npix": 128, "occulter_sampling": 2.0, "monochromatic": 4.44e-6}
 OLD = random_opd(1, npix=128)
 NEW = OLD.data + random_drift(2, 40.0, npix=128).data
@@ -93,7 +93,7 @@ def dataset(frames, model, **settings):
     made.diffrender = DiffrenderSettings(
         model=model, **{
             "error": np.sqrt(np.nan_to_num(np.abs(filled), nan=1.0)),
-            "fit": GaussNewton(basis=default_basis(6.0), response_npix=128), **settings,
+            "settings": FitSettings(basis=default_basis(6.0), response_npix=128), **settings,
         },
     )  # fmt: skip
     return made
@@ -119,7 +119,9 @@ def test_a_library_that_is_not_used_is_said_with_the_reason(frames, small):
         frames, np.sqrt(frames), pixelscale=small.detector.pixelscale, position_angles=[0.0, 90.0]
     )
     library = [replace(observation.part(np.array([0])), reference=True, name="a star beside")]
-    settings = DiffrenderSettings(model=small, fit=ALIGNED, references="off", keep_detected=False)
+    settings = DiffrenderSettings(
+        model=small, settings=ALIGNED, references="off", keep_detected=False
+    )
     with pytest.warns(DiffrenderWarning) as caught:
         subtracted = subtract_by_refinement(observation, OLD, settings, references=library)
     said = [str(each.message) for each in caught if "RDI" in str(each.message)]
@@ -132,7 +134,7 @@ def test_a_library_that_is_not_used_is_said_with_the_reason(frames, small):
 @pytest.mark.slow
 def test_star_goes_companion_stays(small, frames, refined, tmp_path):
     made, image, header, _ = refined
-    outdated = dataset(frames, small, fit=ALIGNED, max_chi2=np.inf)
+    outdated = dataset(frames, small, settings=ALIGNED, max_chi2=np.inf)
     warned = pytest.warns(DiffrenderWarning, match="roll0.*MODEL_MISMATCH.*What to do: .*filter")
     with backend(opd=OLD), warned:
         reduce(outdated, tmp_path)
@@ -161,7 +163,7 @@ def test_star_goes_companion_stays(small, frames, refined, tmp_path):
     (fit,) = made.diffrender_results[0].subtraction.fits
     assert fit.frames == (0, 1)
     assert header["DRCHI2"] == pytest.approx(fit.result.chi2_per_pixel)
-    assert (header["DRSYST"], header["DRREFS"]) == ("none", 0)
+    assert (header["DRPATTRN"], header["DRREFS"]) == ("none", 0)
     assert header["DRREFUSE"] == "no reference frames"
     assert (header["DROPD"], header["DRSHA256"]) == (OLD.name, OLD.sha256)
 
@@ -220,7 +222,7 @@ def test_a_companion_in_the_model_keeps_its_light(small, frames):
     )
     cut = whole.within(Window.about(np.array([19.5, 21.5]), (32, 32)))
     x, y = planet_pixels(0.0)
-    known = GaussNewton(
+    known = FitSettings(
         basis=default_basis(3.0), response_npix=128,
         companions=(Planet.from_offset(CONTRAST, x, y),),
     )  # fmt: skip
@@ -266,7 +268,7 @@ def test_copies_with_added_sources_are_not_fitted_again(small, frames, tmp_path,
     """A fit of flux and background is linear, so that a new fit would do exactly the same."""
     # The map of the throughput takes seconds, and has tests of its own.
     monkeypatch.setattr(klip_call, "throughput_map", lambda fit: np.ones((32, 32)))
-    made = dataset(frames, small, fit=ALIGNED, error=1e3)
+    made = dataset(frames, small, settings=ALIGNED, error=1e3)
     untouched = copy.deepcopy(made)
     pixels = np.indices(frames.shape[1:])
     light = 2e3 * np.exp(-((pixels - np.array([[[30]], [[26]]])) ** 2).sum(axis=0) / 4)
@@ -301,7 +303,7 @@ def test_copies_with_added_sources_are_not_fitted_again(small, frames, tmp_path,
 @pytest.mark.slow
 def test_products_show_the_sky_of_all_rolls(small, frames, tmp_path):
     """A source that turns with the sky is where it belongs, and the estimate is linear."""
-    made = dataset(frames, small, fit=ALIGNED, error=1e3, image="cleaned")
+    made = dataset(frames, small, settings=ALIGNED, error=1e3, image="cleaned")
     pixels = np.indices(made.input.shape[1:])
     changes = []
     with backend(opd=OLD):
@@ -340,7 +342,7 @@ def test_companions_are_kept_by_default_in_real_frames_only(instrument, kept, sm
     observation = Observation.from_arrays(
         star, np.sqrt(star), pixelscale=small.detector.pixelscale, header=header
     )
-    subtract_by_refinement(observation, OLD, DiffrenderSettings(model=small, fit=ALIGNED))
+    subtract_by_refinement(observation, OLD, DiffrenderSettings(model=small, settings=ALIGNED))
     assert bool(given_back) == kept
 
 
@@ -351,7 +353,7 @@ def test_a_header_that_contradicts_the_data_stops_the_reduction(wrong, small, fr
     if wrong == "filter":
         model = nircam_coronagraph("F356W", fov_pixels=32, **NUMERICS | {"monochromatic": 3.56e-6})
         expected = pytest.raises(RefinementError, match=r"roll0: .* max_chi2=100: .*STARCENX.*filt")
-    made = dataset(frames[:1], model, fit=ALIGNED)
+    made = dataset(frames[:1], model, settings=ALIGNED)
     with backend(opd=OLD), expected:
         reduce(made, tmp_path)
     assert bool(list(tmp_path.iterdir())) == (wrong == "nothing")
@@ -360,7 +362,7 @@ def test_a_header_that_contradicts_the_data_stops_the_reduction(wrong, small, fr
 def test_a_fit_that_diverges_stops_the_reduction(small, frames, tmp_path):
     made = dataset(-frames[:1], small)
     refused = pytest.raises(RefinementError, match="roll0: the fit ended as DIVERGED: the fitted")
-    with backend(opd=OLD, fit=ALIGNED), refused as caught:
+    with backend(opd=OLD, settings=ALIGNED), refused as caught:
         reduce(made, tmp_path)
     assert caught.value.result.frames[0].star.shape == (32, 32)
     assert list(tmp_path.iterdir()) == []
@@ -375,7 +377,7 @@ def test_frames_at_one_place_are_averaged_and_all_share_a_fit(small, frames):
         position_angles=np.array([0.0, 10.0, 0.0, 0.04, 0.0]), filter="F444W",
     )  # fmt: skip
     told = []
-    settings = DiffrenderSettings(model=small, fit=ALIGNED, max_chi2=np.inf)
+    settings = DiffrenderSettings(model=small, settings=ALIGNED, max_chi2=np.inf)
     with pytest.warns(DiffrenderWarning):
         rendered = subtract_by_refinement(observation, OLD, settings, tell=told.append)
     (fit,) = rendered.fits
@@ -387,13 +389,13 @@ def test_frames_at_one_place_are_averaged_and_all_share_a_fit(small, frames):
     assert np.isfinite(rendered.star).all()
 
 
-def test_start_and_systematics_reach_the_fit(small, frames):
+def test_start_and_pattern_reach_the_fit(small, frames):
     """The pattern is part of what is subtracted, inside the fitted square and beside it."""
     drawn = 0.05 * np.random.default_rng(6).normal(size=SHAPE)
     measured = drawn.copy()
     measured[:, -3:] = 0.0
     middle = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
-    systematics = Systematics(measured, np.full(SHAPE, 1e-3), middle, 0.05)
+    pattern = DetectorPattern(measured, np.full(SHAPE, 1e-3), middle, 0.05)
     camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
     star = FLUX * camera(OLD.data, (0.02, 0.0)).numpy()
     noise = np.sqrt(star + SKY)
@@ -401,13 +403,13 @@ def test_start_and_systematics_reach_the_fit(small, frames):
     observation = Observation.from_arrays(
         data, noise, pixelscale=small.detector.pixelscale, filter="F444W"
     )
-    settings = DiffrenderSettings(model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)})
+    settings = DiffrenderSettings(model=small, settings=ALIGNED, start={"star_offset": (0.02, 0.0)})
     chi2 = {}
-    for known in (None, systematics):
-        chosen = replace(settings, systematics=known)
+    for known in (None, pattern):
+        chosen = replace(settings, pattern=known)
         with contextlib.nullcontext() if known else pytest.warns(DiffrenderWarning):
             found = subtract_by_refinement(observation, OLD, chosen)
-        assert found.systematics == ("systematics" if known else "none")
+        assert found.pattern == ("pattern" if known else "none")
         (fit,) = found.fits
         assert fit.result.frames[0].values["star_offset"].tolist() == [0.02, 0.0]
         away = ((found.star[0] - star * (1 + measured) - SKY) / noise)[:, :-3]
@@ -433,10 +435,10 @@ def test_frames_that_were_moved_for_the_fit_are_subtracted_where_they_are(side, 
         (frame,) = science
         shifted = shift_frames(frame.data, away[np.newaxis])
         registered = replace(frame, data=shifted, center=frame.center + away)
-        return PatternChoice((registered,), None, settings.fit)
+        return PatternChoice((registered,), None, settings.settings)
 
-    monkeypatch.setattr("pyklip_diffrender.pattern.choice.choose_systematics", moved)
-    settings = DiffrenderSettings(model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)})
+    monkeypatch.setattr("pyklip_diffrender.pattern.choice.choose_pattern", moved)
+    settings = DiffrenderSettings(model=small, settings=ALIGNED, start={"star_offset": (0.02, 0.0)})
     rendered = subtract_by_refinement(observation, OLD, settings)
     inner = np.s_[6:-6, 6:-6]
     wrong = (rendered.star[0] - star)[inner] / np.sqrt(star)[inner]

@@ -24,7 +24,7 @@ from pyklip_diffrender.options import QUICK_SIDE
 from pyklip_diffrender.pattern import PatternLibrary
 from pyklip_diffrender.pattern.library import package_library
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
-from pyklip_diffrender.refinement import GaussNewton, Refinement, fitting
+from pyklip_diffrender.refinement import FitSettings, Refinement, fitting
 from pyklip_diffrender.scene import frame_file
 from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
@@ -130,7 +130,7 @@ def written(folder, light, *, aligned, integrations=2):
 
 
 def map_file(folder):
-    """Write the wavefront map, which surveys read from a file."""
+    """Write the OPD map, which surveys read from a file."""
     path = folder / "opd.fits"
     fits.PrimaryHDU(OPD, fits.Header({"BUNIT": "m"})).writeto(path, overwrite=True)
     return path
@@ -139,34 +139,34 @@ def map_file(folder):
 def settings_of(files):
     """Settings that do not take the files to be opened by the package."""
     passband = fits.getheader(files[0])["FILTER"]
-    return GaussNewton.nircam(passband, image_mask="MASK335R", module="A", **SETTINGS)
+    return FitSettings.nircam(passband, image_mask="MASK335R", module="A", **SETTINGS)
 
 
-def name_of(systematics):
-    return "none" if systematics is None else systematics.name
+def name_of(pattern):
+    return "none" if pattern is None else pattern.name
 
 
 def through_reduce(files, folder):
     made = dr.reduce(files, map_file(folder), size=SIZE, settings=settings_of(files))
-    return Answer(made.fit, made.detection, name_of(made.systematics))
+    return Answer(made.fit, made.detection, name_of(made.pattern))
 
 
 def through_klip_dataset(files, folder):
     dataset = reduce_jwst_files(
-        files, folder=folder, prefix="x", opd=map_file(folder), fit_pixels=SIZE,
-        fit=settings_of(files),
+        files, folder=folder, prefix="x", opd=map_file(folder), size=SIZE,
+        settings=settings_of(files),
     )  # fmt: skip
     (record,) = dataset.diffrender_results
     made = record.subtraction.reduction
-    return Answer(made.fit, made.detection, name_of(made.systematics))
+    return Answer(made.fit, made.detection, name_of(made.pattern))
 
 
 def through_spaceklip(files, folder):
     database = StandIn(folder, {KEY: concatenation([str(path) for path in files])})
-    options = {"opd": map_file(folder), "fit_pixels": SIZE, "fit": settings_of(files)}
+    options = {"opd": map_file(folder), "size": SIZE, "settings": settings_of(files)}
     detection = spaceklip.run_obs(database, **options)[KEY]
     fit = detection.fits[0]
-    return Answer(fit, detection, name_of(fit.systematics))
+    return Answer(fit, detection, name_of(fit.pattern))
 
 
 def through_a_survey(files, folder):
@@ -177,13 +177,13 @@ def through_a_survey(files, folder):
     dr.survey({"workers": 0, "sequence": [sequence]}, folder / "survey")
     (job,) = (each for each in (folder / "survey" / "jobs").iterdir() if each.is_dir())
     fit = Refinement.read(job / "fit.fits")
-    return Answer(fit, Detection.read(job), name_of(fit.systematics))
+    return Answer(fit, Detection.read(job), name_of(fit.pattern))
 
 
-def shares_pattern(observations, systematics):
+def shares_pattern(observations, pattern):
     """Whether frames show the same pixels of the detector, whose pattern is one unknown then."""
     places = {(each.first_pixel, each.shape) for each in observations}
-    return systematics is not None and len(places) == 1 and None not in next(iter(places))
+    return pattern is not None and len(places) == 1 and None not in next(iter(places))
 
 
 def assert_same_frames(ours, others, rtol=1e-6):
@@ -211,7 +211,7 @@ class Call(NamedTuple):
 
     science: tuple[Observation, ...]
     opd: Any
-    systematics: Any
+    pattern: Any
     settings: Any
 
 
@@ -221,7 +221,7 @@ def calls(monkeypatch):
     begun = []
 
     def refine(model, science, opd, **options):
-        begun.append(Call(tuple(science), opd, options["systematics"], options["settings"]))
+        begun.append(Call(tuple(science), opd, options["pattern"], options["settings"]))
         raise Stopped
 
     monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.refine", refine)
@@ -242,10 +242,10 @@ def assert_same_call(one, other):
     assert_same_frames(one.science, other.science)
     assert one.settings == other.settings
     assert one.opd.sha256 == other.opd.sha256
-    ours, others = one.systematics, other.systematics
+    ours, others = one.pattern, other.pattern
     assert name_of(ours) == name_of(others)
     if ours is not None:
-        np.testing.assert_array_equal(ours.pattern, others.pattern)
+        np.testing.assert_array_equal(ours.value, others.value)
         np.testing.assert_array_equal(ours.error, others.error)
     assert shares_pattern(one.science, ours) == shares_pattern(other.science, others)
 
@@ -268,7 +268,7 @@ def test_every_door_begins_the_same_fit(door, aligned, light, tmp_path, calls, e
             each(files, tmp_path)
     first = expected.setdefault(aligned, calls[0])
     # What is compared is worth comparing: alone, each roll would be cut elsewhere.
-    assert shares_pattern(first.science, first.systematics)
+    assert shares_pattern(first.science, first.pattern)
     assert len({Window.about(each.center[0], each.shape) for each in first.science}) == 2
     assert first is not calls[-1]
     assert_same_call(first, calls[-1])
@@ -296,7 +296,7 @@ def test_a_first_look_is_the_same_in_every_door(light, tmp_path, calls, monkeypa
     assert made[0]["nlambda"] in (3, 7)
     assert made[0] == made[1] == made[2]
     first, *others = calls
-    assert first.settings.cycles[0] < GaussNewton.nircam("F444W").cycles[0]
+    assert first.settings.cycles[0] < FitSettings.nircam("F444W").cycles[0]
     assert len(others) == 2
     for each in others:
         assert_same_call(first, each)
@@ -385,8 +385,8 @@ def assert_same(one, other):
     ours, others = ([frame.observation for frame in each.fit.frames] for each in (one, other))
     assert_same_frames(ours, others)
     assert one.pattern == other.pattern
-    assert shares_pattern(ours, one.fit.systematics)
-    assert shares_pattern(others, other.fit.systematics)
+    assert shares_pattern(ours, one.fit.pattern)
+    assert shares_pattern(others, other.fit.pattern)
     assert one.fit.status == other.fit.status
     assert other.fit.log_evidence == pytest.approx(one.fit.log_evidence, rel=1e-4)
     assert other.fit.chi2_per_pixel == pytest.approx(one.fit.chi2_per_pixel, rel=1e-4)

@@ -83,7 +83,7 @@ def test_a_planet_that_ends_a_fit_at_a_wrong_wavefront_is_found(seed, cycles):
 def changed(share, *planets):
     """A model, a map, and a frame of planets under a wavefront that has changed."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)
-    before, change = (dr.random_opd(k, npix=128) for k in (8, 9))
+    before, change = (dr.wavefront.random_opd(k, npix=128) for k in (8, 9))
     now = replace(before, data=before.data + share * change.data)
     return model, dr.simulate(model, dr.Scene(planets=planets), now, seed=5), before, now
 
@@ -93,7 +93,7 @@ def changed(share, *planets):
 def test_a_companion_that_was_an_error_of_the_wavefront_is_dropped(contrast, caplog):
     """The alignment alone leaves peaks, which the wavefront explains; a planet stays."""
     *given, _ = changed(0.2, dr.Planet(contrast, 0.6, 70.0))
-    preset = dr.GaussNewton.nircam(
+    preset = dr.FitSettings.nircam(
         "F444W", cycles=(9.0,), max_iterations=12, companion_threshold=2.0
     )
     with caplog.at_level("INFO", logger="pyklip_diffrender"):
@@ -112,7 +112,7 @@ def test_a_companion_that_outshines_the_star_is_fitted_with_it(caplog, changes):
     *given, now = changed(0.1, planet)
     model = given[0]
     assert model(now).max() < planet.contrast * model(now, planet.offset).max()
-    fit = dr.refine(*given, settings=dr.GaussNewton(cycles=3, max_iterations=6, **changes))
+    fit = dr.refine(*given, settings=dr.FitSettings(cycles=3, max_iterations=6, **changes))
     (companion,) = fit.companions
     assert "outshines" in caplog.text
     assert companion[0] == pytest.approx(planet.contrast, rel=0.03)
@@ -124,7 +124,7 @@ def test_a_companion_that_outshines_the_star_is_fitted_with_it(caplog, changes):
 def test_bright_neighbours_are_companions_of_a_fit():
     """One may be faint, and others are too bright for the wavefront to have left them."""
     *given, _ = changed(0.1, dr.Planet(5e-3, 0.6, 70.0), dr.Planet(3e-3, 0.7, 250.0))
-    fit = dr.refine(*given, settings=dr.GaussNewton(
+    fit = dr.refine(*given, settings=dr.FitSettings(
         cycles=3, max_iterations=6, max_companions=1, companions_if_stalled=False,
     ))  # fmt: skip
     assert sorted(fit.companions[:, 0]) == pytest.approx([3e-3, 5e-3], rel=0.05)
@@ -141,9 +141,9 @@ UNIT = ErrorFactor.constant(1.0)
 def star():
     """The linear model of a star that was fitted, and its templates."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(), opd, seed=2)
-    fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=5))
+    fit = dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=5))
     ((linear, templates),) = groups_of([fit])
     return linear, templates
 
@@ -212,10 +212,10 @@ SIZES = {"star_offset": 1e-3, "detector_shift": 1e-3, "si_zernikes": 2e-9, "mode
 @pytest.fixture(scope="module")
 def fit():
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=64, fov_pixels=36)
-    opd = dr.random_opd(1, npix=64)
+    opd = dr.wavefront.random_opd(1, npix=64)
     planets = (dr.Planet.from_offset(4e-3, *BRIGHT), dr.Planet.from_offset(9e-5, *FAINT))
     frame = dr.simulate(model, dr.Scene(planets=planets), opd, seed=3)
-    settings = dr.GaussNewton(
+    settings = dr.FitSettings(
         free=(*FREE, "flux"), cycles=2, companions=planets[:1], max_companions=0
     )
     return dr.refine(model, frame, opd, settings=settings)

@@ -62,7 +62,7 @@ def test_help_of_a_command_has_sections_and_examples(capsys, command):
         (["fit"], "No such command 'fit'"),
         (["reduce", "-o", "x", "--opd", "y"], "Missing argument 'FRAMES...'"),
         (["detect", "x", "--opd", "y"], "Missing option '-o'"),
-        (["detect", "x", "-o", "y"], "'--opd'. Name the FITS file of a wavefront map"),
+        (["detect", "x", "-o", "y"], "'--opd'. Name the FITS file of an OPD map"),
         (["learn", "x", "-o", "y"], "flat to start without one"),
         (["detect", "x", "-o", "y", "--opd", "z", "--opd-date", "closest"], "nearest"),
         (["detect", "x", "-o", "y", "--opd", "z", "--threshold", "-3"], "threshold: got -3"),
@@ -71,7 +71,7 @@ def test_help_of_a_command_has_sections_and_examples(capsys, command):
         (["detect", "x", "-o", "y", "--opd", "z", "--memory", "2 lightyears"], "memory: got"),
         (["reduce", "x", "-o", "y", "--opd", "z", "--star", "12"], "'12', expected x,y"),
         (["detect", "x", "-o", "y", "--opd", "z", "--disk", "--wide"], "wide, disk: got both"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--systematics", "no.fits"], "systematics: got"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--pattern", "no.fits"], "pattern: got"),
         (["detect", "x", "-o", "y", "--opd", "z", "--opd-folder", "x"], "--opd-folder"),
         (["detect", "x", "-o", "y", "--opd", "z", "--dry-run", "--json"], "--dry-run has no"),
         (["psf", "-o", "x.fits", "--threads", "0"], "--threads"),
@@ -260,7 +260,7 @@ def frames(tmp_path):
 
 @pytest.fixture
 def maps(tmp_path):
-    """A folder of wavefront maps from before and after the frames."""
+    """A folder of OPD maps from before and after the frames."""
     folder = tmp_path / "maps"
     folder.mkdir()
     for day in ("20", "31"):
@@ -301,7 +301,7 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(tmp_path, reduc
         assert next(line for line in lines if f"{name}_calints" in line).split()[:2] == words
     assert any(line.startswith("left out: three_calints.fits: ") for line in lines)
     sensed = "opd_2022-07-31.fits, sensed 2022-07-31T00:00, 0.9 days after the frames"
-    assert f"wavefront map: {sensed}" in lines
+    assert f"OPD map: {sensed}" in lines
     assert lines[-4:] == [
         "1. wavefront", "2. reference stars and target together", "3. search", "4. products",
     ]  # fmt: skip
@@ -473,7 +473,7 @@ def reduced(monkeypatch):
 
 
 def test_reduce_passes_its_options_on_and_names_the_products(tmp_path, reducing, reduced, capsys):
-    options = ["--opd-date", "before", "--threshold", "4", "--systematics", "off"]
+    options = ["--opd-date", "before", "--threshold", "4", "--pattern", "off"]
     options += ["--memory", "2 GB", "--injections", "7", "--star-flux-error", "0.1"]
     assert main([*reducing, *options]) == 0
     shown = capsys.readouterr()
@@ -483,7 +483,7 @@ def test_reduce_passes_its_options_on_and_names_the_products(tmp_path, reducing,
     (call,) = reduced
     assert call.given.wavefront.name == "opd_2022-07-20.fits"
     assert call.given.options == ReduceOptions(
-        size=8, threshold=4.0, systematics="off", memory="2 GB", injections=7, star_flux_error=0.1
+        size=8, threshold=4.0, pattern="off", memory="2 GB", injections=7, star_flux_error=0.1
     )
     # Not on a terminal: no bar, but the stages.
     assert call.progress is False
@@ -602,7 +602,7 @@ def test_mast_is_asked_for_the_map_of_the_date(detecting, reduced, capsys, monke
     def retrieve(date, choice):
         asked.append((date.isot[:19], choice))
         if choice == "after":
-            raise errors.MissingOPDError("no wavefront map from MAST (no route to host)")
+            raise errors.MissingOPDError("no OPD map from MAST (no route to host)")
         return random_opd(1, npix=64)
 
     monkeypatch.setattr("pyklip_diffrender.cli.reducing.load_wss_opd_by_date", retrieve)

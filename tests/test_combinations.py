@@ -60,8 +60,8 @@ FEATURES = {
         ("fitted", "flux", "sed"), lambda s: s["star"]["source"] == "star_flux",
         changes_numbers=True,
     ),
-    "pattern": Feature(
-        ("auto", "library", "file"), lambda s: OTHER in s["systematics"]["stars"],
+    "pattern_file": Feature(
+        ("auto", "library", "file"), lambda s: OTHER in s["pattern"]["stars"],
         changes_numbers=True,
     ),
     "accuracy": Feature(
@@ -96,10 +96,10 @@ REFUSED = [
             "beyond the fitted pixels a disk would be taken for point sources"),
     Refusal("command", {"star": "flux", "filters": FILTERS}, Refused, "expected one for each",
             "a flux density is for one filter"),
-    Refusal("command", {"pattern": "file", "filters": FILTERS}, Refused, "systematics",
+    Refusal("command", {"pattern_file": "file", "filters": FILTERS}, Refused, "pattern",
             "a pattern is of one filter"),
-    Refusal("spaceklip", {"pattern": "file", "filters": FILTERS}, IncompatibleSetupError,
-            "systematics", "a pattern is of one filter; other concatenations go on", FILTERS[:1]),
+    Refusal("spaceklip", {"pattern_file": "file", "filters": FILTERS}, IncompatibleSetupError,
+            "pattern", "a pattern is of one filter; other concatenations go on", FILTERS[:1]),
     Refusal("pyklip", {"filters": FILTERS}, IncompatibleSetupError, "spectral cubes",
             "pyKLIP takes wavelengths of a dataset for slices of spectral cubes"),
     Refusal("pyklip spaceklip", {"epochs": DATES}, IncompatibleSetupError, "2 epochs", ALONE),

@@ -32,10 +32,10 @@ YEAR = 365.25
 def fitted(filter, wavelength, seed):
     """A small frame of a star, searched, with maps in double precision at its pixels."""
     model = dr.nircam_coronagraph(filter, monochromatic=wavelength, npix=64, fov_pixels=16)
-    opd = dr.random_opd(1, npix=64)
+    opd = dr.wavefront.random_opd(1, npix=64)
     frame = dr.simulate(model, dr.Scene(), opd, seed=seed)
     frame = replace(frame, position_angles=np.array([40.0]))
-    return dr.detect(dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=3)))
+    return dr.detect(dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=3)))
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,9 @@ def test_it_is_the_joint_likelihood_of_all_frames(pair):
     joint = stacked([each.groups[0][0] for each in pair])
     at = torch.from_numpy(np.array([grid[pixel] for pixel in pixels]))
     images = [each.groups[0][1].at(at)[0] for each in pair]
-    stars = [dr.star_flux_density("A2V, K=6.77", name).value for name in ("F444W", "F356W")]
+    stars = [
+        dr.instrument.star_flux_density("A2V, K=6.77", name).value for name in ("F444W", "F356W")
+    ]
     for k, flux in enumerate(both.spectra.flux):
         templates = {f: flux[f] / stars[f] * image for f, image in enumerate(images)}
         matrix, vector = joint.normal_equations(templates)

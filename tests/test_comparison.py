@@ -107,7 +107,7 @@ def test_the_page_has_the_combined_map_and_all_limits_side_by_side(tmp_path, mon
 
 
 def dry_run(folder):
-    """Arguments of a dry run on frames in a folder, with a wavefront map that is made here."""
+    """Arguments of a dry run on frames in a folder, with an OPD map that is made here."""
     opd = folder / "opd.fits"
     nanometres = np.random.default_rng(1).normal(0, 30, (64, 64))
     fits.PrimaryHDU(nanometres, fits.Header({"BUNIT": "nm"})).writeto(opd)

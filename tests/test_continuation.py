@@ -11,7 +11,7 @@ import torch
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics import PupilGrid
-from pyklip_diffrender.refinement import GaussNewton, Status, refine_again
+from pyklip_diffrender.refinement import FitSettings, Status, refine_again
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior, default_basis, random_opd
 
@@ -65,7 +65,7 @@ def shot(k=0, planet=None, cycles=CYCLES[0]):
 
 
 def settings(**changes):
-    return GaussNewton(**{"cycles": CYCLES, "response_npix": 64, **changes})
+    return FitSettings(**{"cycles": CYCLES, "response_npix": 64, **changes})
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_fit_with_a_basis_of_its_own_can_go_on(wavefront):
     fit = dr.refine(model(), shot(), before(), settings=own)
     again = refine_again(fit, wavefront=True, max_iterations=12)
     assert again.chi2_per_pixel < 1.001 * fit.chi2_per_pixel
-    assert isinstance(again.settings, GaussNewton)
+    assert isinstance(again.settings, FitSettings)
     scales = again.settings.prior.scales
     assert scales["segment"] == own.prior.scales["segment"]
     assert scales["texture"] == fit.scales["texture"]
@@ -140,7 +140,7 @@ def test_a_fit_goes_on_from_where_it_ended():
     rng = np.random.default_rng(9)
     frame = shot()
     frame = replace(frame, data=frame.data * (1 + 0.05 * rng.normal(size=frame.data.shape)))
-    settings = GaussNewton(
+    settings = FitSettings(
         basis=default_basis(CYCLES[0]), response_npix=64, min_model_error=0.002, robust=4.0,
         companions_if_stalled=False,
         prior=WavefrontPrior({"segment": 10.0, "texture": 6.0}, fit_scales=False),
@@ -158,7 +158,7 @@ def test_a_fit_goes_on_from_where_it_ended():
 
 def test_arguments_that_do_not_go_together_are_refused():
     frames = [shot(0), shot(1)]
-    with pytest.raises(IncompatibleSetupError, match=r"settings: got a str, expected GaussNewton"):
+    with pytest.raises(IncompatibleSetupError, match=r"settings: got a str, expected FitSettings"):
         dr.refine(model(), frames, before(), settings="gauss-newton")
     with pytest.raises(ValueError, match=r"start: got 3 dicts for 2 observations"):
         dr.refine(model(), frames, before(), start=[{}, {}, {}])
@@ -190,21 +190,21 @@ BAD = [
 @pytest.mark.parametrize(("changes", "complaint"), BAD)
 def test_settings_that_cannot_be_are_refused_when_they_are_made(changes, complaint):
     with pytest.raises(IncompatibleSetupError, match=complaint):
-        GaussNewton(**changes)
+        FitSettings(**changes)
     with pytest.raises(IncompatibleSetupError, match=complaint):
-        GaussNewton.nircam(**changes)
+        FitSettings.nircam(**changes)
 
 
 def test_modes_of_the_preset_reach_the_edge_of_the_fitted_square():
     expected = {"F444W": 18, "F480M": 16, "F356W": 22, "F250M": 32, "F210M": 18}
-    assert {name: GaussNewton.nircam(name).cycles[0] for name in expected} == expected
-    assert GaussNewton.nircam() == GaussNewton.nircam("F444W")
+    assert {name: FitSettings.nircam(name).cycles[0] for name in expected} == expected
+    assert FitSettings.nircam() == FitSettings.nircam("F444W")
     with pytest.raises(IncompatibleSetupError, match=r"filter: got .*F444W"):
-        GaussNewton.nircam("F44W")
+        FitSettings.nircam("F44W")
 
 
 @pytest.mark.parametrize("cycles", [6, [6.0], np.float64(6)])
 def test_a_single_number_of_cycles_will_do(cycles):
-    made = GaussNewton(cycles=cycles, free=["flux"], companions=[PLANET])
-    assert made == GaussNewton(cycles=(6.0,), free=("flux",), companions=(PLANET,))
-    assert GaussNewton.nircam(cycles=cycles).cycles == (6.0,)
+    made = FitSettings(cycles=cycles, free=["flux"], companions=[PLANET])
+    assert made == FitSettings(cycles=(6.0,), free=("flux",), companions=(PLANET,))
+    assert FitSettings.nircam(cycles=cycles).cycles == (6.0,)

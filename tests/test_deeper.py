@@ -19,9 +19,9 @@ EDGE = 0.6
 def searches():
     """The same frame, fitted with fewer and with more modes."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=36)
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(planets=PLANETS), opd, seed=3)
-    fits = (dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=n)) for n in (6.0, 8.0))
+    fits = (dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=n)) for n in (6.0, 8.0))
     return tuple(dr.detect(fit) for fit in fits)
 
 

@@ -57,7 +57,7 @@ def test_the_recipe_lowers_the_mean_absolute_error_of_the_valid_pixels(monkeypat
     monkeypatch.syspath_prepend(ROOT / "examples" / "paper")
     recipe = importlib.import_module("recipe").adam_recipe
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=20)
-    opd, after = (dr.random_opd(seed, npix=64).data for seed in (1, 2))
+    opd, after = (dr.wavefront.random_opd(seed, npix=64).data for seed in (1, 2))
     counts = np.random.default_rng(3).poisson(FLUX * model(after).numpy() + BACKGROUND)
     valid = np.random.default_rng(4).random(counts.shape) > 0.05
     scale = model.detector.pixelscale
@@ -135,7 +135,7 @@ def test_psnr_of_a_known_error(monkeypatch):
 
 def test_references_are_nine_dithered_frames_of_the_reference_star():
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=20)
-    opd = dr.random_opd(2, npix=128).data
+    opd = dr.wavefront.random_opd(2, npix=128).data
     frames = simulate_references(model, opd, seed=7)
     assert frames.shape == (9, 20, 20)
     assert len(set(DITHERS)) == 9

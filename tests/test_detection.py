@@ -166,10 +166,10 @@ def test_a_prior_that_is_far_too_narrow_reaches_its_size_at_once(world, caplog):
 
 def test_a_rough_fit_that_does_not_explain_its_data_goes_on(world, monkeypatch):
     """It ends at a chi-squared of 0.997 per pixel, which is not enough here, and goes on."""
-    monkeypatch.setattr(annealing, "_EXPLAINED", 0.97)
+    monkeypatch.setattr(annealing, "_EXPLAINED_CHI2", 0.97)
     observation = world.observed(world.expected(), 4)
     fine = world.refined(observation, tolerance=0.2)
-    monkeypatch.setattr(fitting, "_FINER", np.inf)
+    monkeypatch.setattr(fitting, "_FINER_TOLERANCE", np.inf)
     rough = world.refined(observation, tolerance=0.2)
     assert (rough.status, fine.status) == (Status.MODEL_MISMATCH, Status.CONVERGED)
     assert fine.history[: len(rough.history)] == rough.history
@@ -182,7 +182,7 @@ def test_the_prior_on_the_segments_is_wider_for_an_older_map(world):
 
     def start(days, **changes):
         opd = replace(as_opd_map(world.opd), date=Time("2023-01-01") - days * u.day)
-        settings = dr.GaussNewton(basis=world.basis, prior=prior, max_iterations=1, **changes)
+        settings = dr.FitSettings(basis=world.basis, prior=prior, max_iterations=1, **changes)
         return dr.refine(world.model, observation, opd, settings=settings).settings.prior.scales
 
     assert start(50, adapt_prior=True) == prior.scales

@@ -165,7 +165,7 @@ def test_patterns_are_combined_pixel_by_pixel_of_the_detector():
     known = combine_patterns([one, other])
     assert known.first_pixel == (600, 1629)
     truth = 0.05 * np.random.default_rng(5).normal(size=(60, 60))
-    inside = known.pattern[3:38, 3:38] - truth[7:42, 8:43]
+    inside = known.value[3:38, 3:38] - truth[7:42, 8:43]
     # The average of two, shrunk a little.
     assert inside.std() == pytest.approx(0.01 / np.sqrt(2), rel=0.1)
     assert known.provenance["stars"] == ["A", "BB"]
@@ -177,7 +177,7 @@ def test_patterns_are_combined_pixel_by_pixel_of_the_detector():
 @pytest.mark.parametrize("name", ["F444W", "F356W"])
 def test_the_library_knows_other_stars_on_the_same_pixels(tmp_path, name):
     cut = dr.Observation.from_fits(aligned_file(tmp_path / "a.fits", FILTER=name)).cutout(80)
-    known = dr.known_systematics(cut)
+    known = dr.known_pattern(cut)
     assert known.filter == name
     assert known.provenance["stars"] == ["HIP17695", "G-7-34"]
     pattern, error = known.at(cut)
@@ -186,11 +186,11 @@ def test_the_library_knows_other_stars_on_the_same_pixels(tmp_path, name):
     near = np.hypot(x, y) < 20
     assert 0.02 < pattern[near].std() < 0.08
     assert np.median(error[near]) < 0.5 * pattern[near].std()
-    assert dr.known_systematics(cut, library=False) is None
-    assert dr.known_systematics(replace(cut, first_pixel=(100, 100))) is None
+    assert dr.known_pattern(cut, library=False) is None
+    assert dr.known_pattern(replace(cut, first_pixel=(100, 100))) is None
     # The target itself is left out.
     cut.header["TARGPROP"] = "HIP 17695"
-    assert dr.known_systematics(cut).provenance["stars"] == ["G-7-34"]
+    assert dr.known_pattern(cut).provenance["stars"] == ["G-7-34"]
 
 
 @cache
@@ -201,7 +201,7 @@ def system():
 def test_lost_pixels_are_found_by_the_pattern():
     """The star falls `moved` off its place among the pixels of the pattern's detector."""
     flat = 0.06 * np.random.default_rng(8).normal(size=(38, 38))
-    opd, moved = dr.random_opd(1, npix=64), np.array([0.3, 1.2])
+    opd, moved = dr.wavefront.random_opd(1, npix=64), np.array([0.3, 1.2])
     frames = dr.simulate(system(), dr.Scene(dr.Star(exposure=20.0)), opd, seed=3)
     net = np.round(moved) - moved
     onto = np.fft.ifft2(fourier_shift(np.fft.fft2(frames.data[0]), net[::-1])).real
@@ -213,9 +213,9 @@ def test_lost_pixels_are_found_by_the_pattern():
     valid[0, 12, 20] = False
     header = fits.Header({"DETECTOR": "NRCALONG"})
     observation = replace(frames, data=np.where(valid, data, 0.0), valid=valid, header=header)
-    settings = dr.GaussNewton(cycles=6, min_model_error=0.05)
+    settings = dr.FitSettings(cycles=6, min_model_error=0.05)
     fit = dr.refine(system(), observation, opd, settings=settings)
-    known = dr.Systematics(
+    known = dr.DetectorPattern(
         flat, np.full(flat.shape, 0.01), (18.5, 18.5), unknown=0.06, first_pixel=(100, 200)
     )
     frame = place_on_detector(fit, known)

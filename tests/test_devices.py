@@ -16,10 +16,10 @@ from pyklip_diffrender.bridges import from_poppy
 from pyklip_diffrender.bridges.sampled_planes import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
 from pyklip_diffrender.linear import ResponseCache
-from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.refinement import FitSettings, Refinement
 from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.refinement.solver import Solver
-from pyklip_diffrender.scene import Systematics
+from pyklip_diffrender.scene import DetectorPattern
 from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior
 
 NPIX, SIZE = 64, 24
@@ -39,7 +39,7 @@ def model_on(device, **changes):
 
 
 def opd():
-    return dr.random_opd(1, npix=NPIX).data
+    return dr.wavefront.random_opd(1, npix=NPIX).data
 
 
 def tensors(model):
@@ -64,8 +64,8 @@ def rolls():
 def settings(**changes):
     """A fit of all parameters, of the wavefront and of the pupil's amplitude."""
     prior = WavefrontPrior(amplitude_cycles=1.5, amplitude_scale=1.0)
-    chosen = {"free": GaussNewton.nircam().free, "prior": prior, **changes}
-    return GaussNewton(basis=BASIS, response_npix=NPIX, **chosen)
+    chosen = {"free": FitSettings.nircam().free, "prior": prior, **changes}
+    return FitSettings(basis=BASIS, response_npix=NPIX, **chosen)
 
 
 def fitted(device, frames, changes=None, **model):
@@ -115,7 +115,7 @@ def point_sources(device, **changes):
 
 def fit_gradient(device, **changes):
     """Through the model itself, by everything that a fit may vary."""
-    problem = Problem(model_on(device, **changes), frame(), dr.random_opd(1, npix=NPIX))
+    problem = Problem(model_on(device, **changes), frame(), dr.wavefront.random_opd(1, npix=NPIX))
     solver = Solver([problem], settings(), BASIS, progress=False)
     unknowns = solver.first_unknowns(solver.priors_of(solver.settings))
     (point,) = solver.objective.at(unknowns, unknowns.initial()).points
@@ -231,18 +231,18 @@ def test_what_a_search_leaves_behind(tmp_path):
 
 
 @pytest.mark.slow
-def test_systematics():
+def test_a_pattern():
     seen = frame()
     pattern = 0.01 * np.sin(np.arange(SIZE**2).reshape(SIZE, SIZE))
-    known = Systematics(pattern, 0.1 * np.abs(pattern), tuple(seen.center[0]), 0.5)
+    known = DetectorPattern(pattern, 0.1 * np.abs(pattern), tuple(seen.center[0]), 0.5)
 
     def corrected(device):
         start = opd()
         fit = dr.refine(
-            model_on(device), [seen, frame(1)], start, settings=settings(**QUICK), systematics=known
+            model_on(device), [seen, frame(1)], start, settings=settings(**QUICK), pattern=known
         )
-        learned = dr.learn_systematics([fitted(device, [frame(k)], QUICK) for k in (0, 1)])
-        return [*reached(fit), float(np.std(learned.pattern))]
+        learned = dr.learn_pattern([fitted(device, [frame(k)], QUICK) for k in (0, 1)])
+        return [*reached(fit), float(np.std(learned.value))]
 
     agree(corrected, rtol=1e-4)
 

@@ -13,6 +13,7 @@ import shlex
 import tomllib
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 
 import click
@@ -30,9 +31,18 @@ PROGRAM = "pyklip-diffrender"
 
 OBJECTS = {
     "detection": dr.Detection, "fit": dr.Refinement, "result": dr.Reduction,
-    "sequence": dr.Sequence, "wavefront": OPDMap,
+    "sequence": dr.ExposureSequence, "wavefront": OPDMap,
 }  # fmt: skip
 """Classes of variables that the documentation calls by these names."""
+
+PACKAGES = (dr, dr.detection, dr.linear, dr.pattern, dr.pyklip_backend, dr.scene, dr.wavefront)
+CLASSES = {
+    name: getattr(package, name)
+    for package in PACKAGES
+    for name in package.__all__
+    if inspect.isclass(getattr(package, name))
+}
+"""Classes that the text may call by their names alone."""
 
 
 @dataclass(frozen=True)
@@ -140,16 +150,26 @@ def test_names_and_arguments_in_documented_code_exist():
             for name in node.names:
                 if not hasattr(module, name.name):
                     importlib.import_module(f"{node.module}.{name.name}")
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            owner = dr if node.value.id == "dr" else OBJECTS.get(node.value.id)
+        if isinstance(node, ast.Attribute):
+            owner = named(node.value)
             if owner is not None:
-                assert node.attr in members(owner), f"{block}: no {node.value.id}.{node.attr}"
+                assert node.attr in members(owner), f"{block}: no {ast.unparse(node)}"
         if isinstance(node, ast.Call):
             require_arguments(block, node)
 
 
+def named(node):
+    """The package, module or class that code names; None for anything else."""
+    if isinstance(node, ast.Name):
+        return dr if node.id == "dr" else OBJECTS.get(node.id)
+    if isinstance(node, ast.Attribute):
+        found = getattr(named(node.value), node.attr, None)
+        return found if inspect.ismodule(found) or inspect.isclass(found) else None
+    return None
+
+
 def members(owner):
-    names = set(dir(owner))
+    names = {*dir(owner), *getattr(owner, "__all__", ())}
     if is_dataclass(owner):
         names |= {each.name for each in fields(owner)}
     return names
@@ -157,20 +177,20 @@ def members(owner):
 
 def require_arguments(block, call):
     """Check the keywords of calls of the package's functions and methods."""
-    if not (isinstance(call.func, ast.Attribute) and isinstance(call.func.value, ast.Name)):
-        return
-    variable = call.func.value.id
-    owner = dr if variable == "dr" else OBJECTS.get(variable)
-    function = getattr(owner, call.func.attr, None)
-    if owner is None or function is None:
+    owner = named(call.func.value) if isinstance(call.func, ast.Attribute) else None
+    function = getattr(owner, call.func.attr, None) if owner is not None else None
+    if function is None:
         return
     parameters = inspect.signature(function).parameters
     taken = {name for name, each in parameters.items() if each.kind is not each.VAR_KEYWORD}
     # Keywords of these are fields of a class with settings.
-    taken |= {each.name for each in (*fields(dr.DiffrenderSettings), *fields(ReduceOptions))}
+    taken |= {
+        each.name
+        for each in (*fields(dr.pyklip_backend.DiffrenderSettings), *fields(ReduceOptions))
+    }
     for keyword in call.keywords:
         assert keyword.arg is None or keyword.arg in taken, (
-            f"{block}: {variable}.{call.func.attr} takes no {keyword.arg}"
+            f"{block}: {ast.unparse(call.func)} takes no {keyword.arg}"
         )
 
 
@@ -204,10 +224,10 @@ def test_attributes_and_files_that_the_text_names_exist():
         text = path.read_text(encoding="utf-8")
         prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
         for owner, name in re.findall(r"`(?:dr\.)?([A-Z]\w+)\.(\w+)", prose):
-            if owner in dr.__all__ and path.name != "changelog.md":
-                assert name in members(getattr(dr, owner)), f"{path.name}: no {owner}.{name}"
-        for name in re.findall(r"`dr\.(\w+)", prose):
-            assert hasattr(dr, name) or path.name == "changelog.md", f"{path.name}: no dr.{name}"
+            if owner in CLASSES and path.name != "changelog.md":
+                assert name in members(CLASSES[owner]), f"{path.name}: no {owner}.{name}"
+        for name in re.findall(r"`dr\.(\w+(?:\.\w+)*)", prose):
+            assert attrgetter(name)(dr) is not None, f"{path.name}: no dr.{name}"
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text) if path in PAGES[:2] else ():
             exists = target.startswith("http") or (ROOT / target).exists()
             assert exists, f"{path.name}: {target}"

@@ -234,8 +234,8 @@ def test_keywords_fit_on_cards():
 def test_values_are_such_as_headers_can_hold():
     header = fits.Header()
     set_keyword(header, "DRCHI2", math.nan)
-    set_keyword(header, "DRSYST", "Übersicht β")
-    assert (header["DRCHI2"], header["DRSYST"]) == ("nan", "Ubersicht ?")
+    set_keyword(header, "DRPATTRN", "Übersicht β")
+    assert (header["DRCHI2"], header["DRPATTRN"]) == ("nan", "Ubersicht ?")
     with pytest.raises(KeyError, match="DROPDNAM"):
         set_keyword(header, "DROPDNAM", "map.fits")
 

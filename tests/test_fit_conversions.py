@@ -15,7 +15,7 @@ from benchmarks.stpsf_data import lopsided
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf
 from pyklip_diffrender.instrument import maskrnd_openings
 from pyklip_diffrender.optics import OpticalSystem, PupilGrid, polygon_coverage
-from pyklip_diffrender.refinement import GaussNewton, Status
+from pyklip_diffrender.refinement import FitSettings, Status
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront import FourierModes
 
@@ -113,7 +113,7 @@ def test_a_frame_made_by_stpsf(stpsf_path):
         model, model.entrance.opd.numpy(), later.numpy(), star, light, planet, 3e10,
         stop & (model.entrance.lit.numpy()),
     )  # fmt: skip
-    check(world, GaussNewton(cycles=8.0, response_npix=64), seed=8)
+    check(world, FitSettings(cycles=8.0, response_npix=64), seed=8)
 
 
 DIAMETER = 2.4
@@ -162,7 +162,7 @@ def test_a_frame_made_by_poppy():
     )
     world = World(model, before, later, star, light, planet, 5e8, stop_of(npix))
     free = ("star_offset", "flux", "background")
-    check(world, GaussNewton(basis=FourierModes(5.0), free=free, response_npix=npix))
+    check(world, FitSettings(basis=FourierModes(5.0), free=free, response_npix=npix))
 
 
 def test_the_segments_of_jwst_are_no_modes_of_another_telescope():
@@ -173,7 +173,7 @@ def test_the_segments_of_jwst_are_no_modes_of_another_telescope():
     model = from_poppy(osys, 4.4e-6)
     image = 1e6 * model().numpy()
     observation = Observation.from_arrays(image, np.sqrt(image + 1), pixelscale=0.06)
-    settings = GaussNewton(cycles=3, free=("flux",), response_npix=64)
+    settings = FitSettings(cycles=3, free=("flux",), response_npix=64)
     fit = dr.refine(model, observation, np.zeros((64, 64)), settings=settings)
     assert fit.basis.groups == ("texture",)
     assert fit.status.usable

@@ -19,7 +19,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, register, unregister
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.scene import Planet
 from pyklip_diffrender.wavefront import default_basis, random_drift, random_opd
 
@@ -34,7 +34,7 @@ SEPARATION, PA, CONTRAST = 11.3, 25.0, 1e-6
 NUMERICS = {"npix": 128, "occulter_sampling": 2.0, "monochromatic": 4.44e-6}
 OLD = random_opd(1, npix=128)
 NEW = OLD.data + random_drift(2, 40.0, npix=128).data
-LINEAR = GaussNewton(free=("flux", "background"), wavefront=False)
+LINEAR = FitSettings(free=("flux", "background"), wavefront=False)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def shots(model, opd, flipx=False):
 def dataset(cube, model, errors, **settings):
     made = generic(cube, ANGLES, center=CENTER)
     made.diffrender = DiffrenderSettings(
-        **{"opd": OLD, "model": model, "error": errors, "fit": LINEAR, **settings}
+        **{"opd": OLD, "model": model, "error": errors, "settings": LINEAR, **settings}
     )
     return made
 
@@ -214,7 +214,7 @@ def test_a_high_pass_filter_applies_to_the_forward_model(model, tmp_path):
 def test_a_planet_of_the_fit_loses_no_light(model, tmp_path):
     star, planet = shots(model, OLD.data)
     known = replace(LINEAR, companions=(Planet.from_offset(CONTRAST, *place(ANGLES[0])),))
-    made = dataset(star + planet, model, np.sqrt(star), fit=known)
+    made = dataset(star + planet, model, np.sqrt(star), settings=known)
     of_planet, product = modelled(made, planet_psf(OLD.data, made), tmp_path, algo="diffrender")
     turned = [rotate(*each, CENTER) for each in zip(planet, ANGLES, strict=True)]
     assert away(of_planet[0], np.nanmean(turned, axis=0)) < 0.015
@@ -223,8 +223,8 @@ def test_a_planet_of_the_fit_loses_no_light(model, tmp_path):
 
 @pytest.mark.slow
 def test_the_wavefront_takes_what_the_forward_model_says(model, tmp_path):
-    fit = GaussNewton(basis=default_basis(10.0), response_npix=128)
-    difference, of_planet, planet, made = added(model, NEW, tmp_path, fit=fit)
+    fit = FitSettings(basis=default_basis(10.0), response_npix=128)
+    difference, of_planet, planet, made = added(model, NEW, tmp_path, settings=fit)
     assert made.diffrender_results[0].subtraction.fits[0].result.status.name == "CONVERGED"
     assert away(difference, of_planet) < 0.1
     assert away(difference, planet) > 0.3

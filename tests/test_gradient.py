@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.refinement.forward import Forward, FrameDerivatives, Problem, allowance
 from pyklip_diffrender.refinement.solver import (
     ModelDerivatives,
@@ -17,7 +17,7 @@ from pyklip_diffrender.refinement.solver import (
     conjugate_gradients,
     linearise,
 )
-from pyklip_diffrender.scene import Systematics
+from pyklip_diffrender.scene import DetectorPattern
 from pyklip_diffrender.wavefront import WavefrontPrior, default_basis
 
 NPIX, SIZE = 64, 32
@@ -31,20 +31,22 @@ def solver_of(frames, **changes):
     """A solver and a state far from the solution, for frames of the same pixels with a pattern."""
     rng = np.random.default_rng(4)
     model = dr.nircam_coronagraph("F444W", nlambda=3, npix=NPIX, fov_pixels=SIZE)
-    opd = dr.random_opd(3, npix=NPIX)
+    opd = dr.wavefront.random_opd(3, npix=NPIX)
     zeros = np.zeros((SIZE, SIZE))
-    pattern = Systematics(zeros, zeros + 0.02, (SIZE / 2, SIZE / 2), 0.02, first_pixel=(600, 1600))
+    pattern = DetectorPattern(
+        zeros, zeros + 0.02, (SIZE / 2, SIZE / 2), 0.02, first_pixel=(600, 1600)
+    )
     problems = []
     for _ in range(frames):
         data = 1e9 * model(opd.data).numpy() * (1 + 0.1 * rng.normal(size=(SIZE, SIZE)))
         error = np.sqrt(np.abs(data)) + 40.0
         seen = dr.Observation.from_arrays(data, error, pixelscale=model.detector.pixelscale)
         seen = replace(seen, first_pixel=(600, 1600))
-        problems.append(Problem(model, seen, opd, systematics=pattern))
+        problems.append(Problem(model, seen, opd, pattern=pattern))
     # The copy is far coarser than the model, in one of its three wavelengths.
     coarse = {"response_npix": 32, "response_wavelengths": 1}
     prior = WavefrontPrior(SCALES, fit_scales=False, amplitude_cycles=2.0, amplitude_scale=2.0)
-    settings = GaussNewton(free=FREE, basis=BASIS, prior=prior, **coarse, **changes)
+    settings = FitSettings(free=FREE, basis=BASIS, prior=prior, **coarse, **changes)
     solver = Solver(problems, settings, BASIS, progress=False)
     priors = solver.priors_of(settings)
     unknowns = solver.first_unknowns(priors)

@@ -9,7 +9,12 @@ import torch
 from scipy.signal import convolve2d
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.imaging import _BEAM, _STRENGTH, SkyModel, interpolation_matrix
+from pyklip_diffrender.imaging import (
+    _BEAM_FWHM_LAMBDA_D,
+    _PRIOR_SOURCE_SNR,
+    SkyModel,
+    interpolation_matrix,
+)
 
 SIZE, NPIX, CONTRAST = 24, 64, 4e-7
 PLACE = (0.45, 0.3)  # x, y arcsec of a planet from the star in the first frame.
@@ -19,7 +24,7 @@ PLACE = (0.45, 0.3)  # x, y arcsec of a planet from the star in the first frame.
 def sky():
     """Of two rolls of a star with a faint planet, fitted without it."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
-    opd = dr.random_opd(1, npix=NPIX)
+    opd = dr.wavefront.random_opd(1, npix=NPIX)
     frames = []
     for k, angle in enumerate((0.0, 30.0)):
         # On the detector, the sky turns clockwise as the position angle of +y grows.
@@ -27,7 +32,7 @@ def sky():
         shot = dr.simulate(model, dr.Scene(planets=(planet,)), opd, seed=k)
         frames.append(replace(shot, position_angles=np.full(len(shot), angle)))
     return SkyModel(
-        [dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=3, max_companions=0))]
+        [dr.refine(model, frames, opd, settings=dr.FitSettings(cycles=3, max_companions=0))]
     )
 
 
@@ -92,7 +97,7 @@ def test_a_source_in_white_noise_keeps_its_peak():
     places = np.indices(model.shape).reshape(2, -1).T - model.center
     image = convolve2d(source, kernel, mode="same", boundary="wrap")
     images = np.array([np.roll(image, place, (0, 1)).ravel() for place in places])
-    sigma = _STRENGTH / np.linalg.norm(kernel)
+    sigma = _PRIOR_SOURCE_SNR / np.linalg.norm(kernel)
     system = np.eye(len(places)) / sigma**2 + images @ images.T
     kept = np.linalg.solve(system, images @ image.ravel()).reshape(model.shape)
     beam = np.fft.fftshift(np.fft.ifft2(model._beam).real)
@@ -101,7 +106,7 @@ def test_a_source_in_white_noise_keeps_its_peak():
     # Variance of the beam along x.
     variance = (beam * places[:, 1].reshape(beam.shape) ** 2).sum() / beam.sum()
     fwhm = np.sqrt(8 * np.log(2) * variance) * model.pixelscale
-    assert fwhm == pytest.approx(_BEAM * model.resolution, rel=0.02)
+    assert fwhm == pytest.approx(_BEAM_FWHM_LAMBDA_D * model.resolution, rel=0.02)
 
 
 def test_a_source_has_the_stated_throughput():

@@ -31,7 +31,7 @@ def model():
 
 @cache
 def opd(seed):
-    return np.asarray(dr.random_opd(seed, npix=NPIX).data)
+    return np.asarray(dr.wavefront.random_opd(seed, npix=NPIX).data)
 
 
 def frame(seed, angle, shift=(0.0, 0.0)):

@@ -1,4 +1,4 @@
-"""Flat-field patterns: learned from many stars, and chosen for a target."""
+"""Detector patterns: learned from many stars, and chosen for a target."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -17,19 +17,19 @@ from pyklip_diffrender import errors
 from pyklip_diffrender.pattern import (
     MeasuredPattern,
     as_request,
-    choose_systematics,
+    choose_pattern,
     combine_patterns,
     package_library,
 )
 from pyklip_diffrender.pyklip_backend import subtract_by_refinement
 from pyklip_diffrender.reduction import ReduceOptions, prepare
-from pyklip_diffrender.scene.systematics import caveat
+from pyklip_diffrender.scene.detector_pattern import caveat
 
 SIZE = 32
 FLAT = "crds://jwst_nircam_flat_9999.fits"
-OPD = dr.random_opd(1, npix=256)
+OPD = dr.wavefront.random_opd(1, npix=256)
 # The frames differ from the model by flux and pattern only.
-ALIGNED = dr.GaussNewton(free=("flux", "background"), wavefront=False, companions_if_stalled=False)
+ALIGNED = dr.FitSettings(free=("flux", "background"), wavefront=False, companions_if_stalled=False)
 RMS = 0.05
 PATTERN = RMS * np.random.default_rng(5).normal(size=(SIDE, SIDE))
 PEDESTAL = 1.0
@@ -38,7 +38,9 @@ PEDESTAL = 1.0
 @pytest.fixture(scope="module")
 def starlight(tmp_path_factory):
     """The image of a star of unit flux in frames like those of `calints`."""
-    (frame,) = dr.Sequence.from_files([written(tmp_path_factory.mktemp("one"), "HD 1")]).science
+    (frame,) = dr.ExposureSequence.from_files(
+        [written(tmp_path_factory.mktemp("one"), "HD 1")]
+    ).science
     cut = frame.cutout(SIZE)
     model = dr.model_for(frame, SIZE)
     middle = (SIZE - 1) / 2
@@ -69,7 +71,7 @@ def frames(tmp_path, starlight):
 
 
 def learned(frames, **options):
-    return dr.learn_library(frames, OPD, size=SIZE, settings=ALIGNED, **options)
+    return dr.pattern.learn_patterns(frames, OPD, size=SIZE, settings=ALIGNED, **options)
 
 
 def test_the_pattern_of_one_star_holds_for_the_other(frames, tmp_path):
@@ -87,7 +89,7 @@ def test_the_pattern_of_one_star_holds_for_the_other(frames, tmp_path):
     assert np.isnan(rows["shown"][1])
     # Frames of a third star would be fitted with the pattern that is there.
     frame = dr.Observation.from_fits(written(tmp_path, "HD 3", 9)).cutout(SIZE)
-    known = dr.known_systematics(frame, library=library)
+    known = dr.known_pattern(frame, library=library)
     assert known.provenance["stars"] == ["HD 1", "HD 2"]
     x, y = np.array(frame.first_pixel) - (600, 1600)
     truth, (got, error) = PATTERN[y : y + SIZE, x : x + SIZE], known.at(frame)
@@ -97,13 +99,13 @@ def test_the_pattern_of_one_star_holds_for_the_other(frames, tmp_path):
     # Errors are those for another frame, whose scatter from frame to frame adds to them.
     assert 0.3 < ((got - truth) / error)[sure].std() < 1.3
     # The same run takes its fits from the folder; one that is damaged is made again.
-    fits = sorted((tmp_path / "fits").iterdir())
-    assert len(fits) == 3
-    times = [each.stat().st_mtime_ns for each in fits]
-    fits[0].write_bytes(fits[0].read_bytes()[:5000])
+    kept = sorted((tmp_path / "fits").iterdir())
+    assert len(kept) == 3
+    times = [each.stat().st_mtime_ns for each in kept]
+    kept[0].write_bytes(kept[0].read_bytes()[:5000])
     again = learned(frames, folder=tmp_path / "fits")
-    assert sorted((tmp_path / "fits").iterdir()) == fits
-    assert [each.stat().st_mtime_ns for each in fits][1:] == times[1:]
+    assert sorted((tmp_path / "fits").iterdir()) == kept
+    assert [each.stat().st_mtime_ns for each in kept][1:] == times[1:]
     for one, other in zip(library.patterns, again.patterns, strict=True):
         np.testing.assert_allclose(one.value, other.value, atol=1e-9)
 
@@ -201,10 +203,10 @@ def test_pedestals_are_brought_together():
     bare = replace(measured("B", pedestal=0.7), light=None)
     for second, expected in ((measured("B"), 1.0), (bare, 0.7)):
         library = dr.PatternLibrary((other, second, measured("C")))
-        assert dr.known_systematics(frame, library=library).pedestal == expected
+        assert dr.known_pattern(frame, library=library).pedestal == expected
     both = dr.PatternLibrary((bare, replace(measured("C"), light=None)))
     with pytest.raises(errors.IncompatibleSetupError, match="without its star"):
-        dr.known_systematics(frame, library=both)
+        dr.known_pattern(frame, library=both)
 
 
 def test_libraries_survive_their_files_and_are_combined(tmp_path):
@@ -229,32 +231,32 @@ def test_libraries_survive_their_files_and_are_combined(tmp_path):
     assert c.light is None
     assert (a.detector, a.flat, a.image_mask) == ("NRCALONG", "new.fits", "MASK335R")
     assert a.catalogue == replace(catalogue, names=("A", "A 1"))
-    assert len(dr.combine_libraries([both, package_library()]).patterns) == 11
+    assert len(dr.pattern.combine_libraries([both, package_library()]).patterns) == 11
     (tmp_path / "one.fits.gz").unlink()
-    measured_file = dr.Systematics(np.zeros((8, 8)), np.ones((8, 8)), (15.5, 15.5), 0.1)
-    measured_file.write(tmp_path / "systematics.fits")
-    with pytest.raises(errors.CorruptFileError, match=r"systematics.fits: got no version"):
+    measured_file = dr.DetectorPattern(np.zeros((8, 8)), np.ones((8, 8)), (15.5, 15.5), 0.1)
+    measured_file.write(tmp_path / "pattern.fits")
+    with pytest.raises(errors.CorruptFileError, match=r"pattern.fits: got no version"):
         dr.PatternLibrary.read(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(errors.CorruptFileError, match="no FITS files"):
         dr.PatternLibrary.read(tmp_path / "empty")
 
 
-def test_a_folder_of_libraries_is_a_choice_of_systematics(tmp_path):
+def test_a_folder_of_libraries_is_a_choice_of_pattern(tmp_path):
     dr.PatternLibrary((measured("A"), measured("B"))).write(tmp_path / "own" / "one.fits")
-    options = ReduceOptions(size=SIZE, systematics=tmp_path / "own")
-    assert isinstance(options.systematics, dr.PatternLibrary)
+    options = ReduceOptions(size=SIZE, pattern=tmp_path / "own")
+    assert isinstance(options.pattern, dr.PatternLibrary)
     frame = observation(R_FLAT="new.fits")
-    chosen = choose_systematics([frame], [], model(), OPD, systematics=options.systematics)
+    chosen = choose_pattern([frame], [], model(), OPD, pattern=options.pattern)
     assert chosen.label == "library (A, B)"
     # Where the folder has nothing, the package's library may have something.
     other = replace(observation(R_FLAT="jwst_nircam_flat_0465.fits"), first_pixel=(620, 1650))
-    chosen = choose_systematics([other], [], model(), OPD, systematics=options.systematics)
+    chosen = choose_pattern([other], [], model(), OPD, pattern=options.pattern)
     assert chosen.label == "library (HIP17695, G-7-34)"
-    settings = dr.DiffrenderSettings(systematics=tmp_path / "own")
-    assert len(settings.systematics.patterns) == 2
-    with pytest.raises(errors.IncompatibleSetupError, match=r"systematics: got .*nowhere"):
-        dr.DiffrenderSettings(systematics=tmp_path / "nowhere")
+    settings = dr.pyklip_backend.DiffrenderSettings(pattern=tmp_path / "own")
+    assert len(settings.pattern.patterns) == 2
+    with pytest.raises(errors.IncompatibleSetupError, match=r"pattern: got .*nowhere"):
+        dr.pyklip_backend.DiffrenderSettings(pattern=tmp_path / "nowhere")
 
 
 @pytest.mark.slow
@@ -264,9 +266,9 @@ def test_real_stars_teach_the_pattern_of_another(shared_data):
         "cycles": 9.0, "max_companions": 0, "max_iterations": 8, "response_npix": 64,
         "accurate_steps": False, "companions_if_stalled": False,
     }  # fmt: skip
-    library = dr.learn_library(
+    library = dr.pattern.learn_patterns(
         shared_data / "gto1184", shared_data / "opd_2022-08-14.fits.gz", filters=["F444W"], size=32,
-        stars=["HIP 17695", "G 7-34"], settings=dr.GaussNewton.nircam("F444W", **settings),
+        stars=["HIP 17695", "G 7-34"], settings=dr.FitSettings.nircam("F444W", **settings),
     )  # fmt: skip
     rows = library.validation
     assert list(rows["star"]) == ["HIP17695", "G-7-34"]
@@ -281,7 +283,7 @@ def test_real_stars_teach_the_pattern_of_another(shared_data):
         assert np.corrcoef(pattern.value[both], other.value[there][both])[0, 1] > 0.7
 
 
-COARSE = dr.random_opd(1, npix=64)
+COARSE = dr.wavefront.random_opd(1, npix=64)
 LIBRARY = {"INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R"}
 SAME_FLAT = {**LIBRARY, "R_FLAT": "crds://jwst_nircam_flat_0465.fits"}
 OTHER_FLAT = {**LIBRARY, "R_FLAT": "crds://jwst_nircam_flat_0999.fits"}
@@ -304,7 +306,7 @@ def frame(target, cards, *, shown=1.0, seed=1):
         unit=u.MJy / u.sr, name=f"{target} {seed}", first_pixel=PLACE,
         header=fits.Header({"TARGPROP": target, **LIBRARY}), position_angles=np.array([5.0 * seed]),
     )  # fmt: skip
-    known = dr.known_systematics(blank)
+    known = dr.known_pattern(blank)
     noise = 0.01 * np.sqrt(light + 1.0)
     data = light + shown * known.at(blank)[0] * (light + known.pedestal)
     data += noise * np.random.default_rng(seed).standard_normal(light.shape)
@@ -328,31 +330,31 @@ def rolls(cards, **changes):
 )
 def test_references_are_fitted_only_where_they_are_needed(request_, cards, fitted, label, used):
     zeros = np.zeros((SIZE, SIZE))
-    mine = dr.Systematics(zeros, zeros, (15.5, 15.5), 0.1, name="mine")
+    mine = dr.DetectorPattern(zeros, zeros, (15.5, 15.5), 0.1, name="mine")
     read = []
 
     def references():
         read.extend(frame("REF", cards, seed=k) for k in (3, 4))
         return read
 
-    chosen = choose_systematics(
+    chosen = choose_pattern(
         # Two rolls, which would share a pattern of their own if nothing else were known.
         rolls(cards), references, model(), COARSE, settings=ALIGNED,
-        systematics=mine if request_ == "mine" else request_,
+        pattern=mine if request_ == "mine" else request_,
     )  # fmt: skip
     assert bool(read) == bool(chosen.references) == fitted
     assert (chosen.label, sum(len(fit.frames) for fit in chosen.references)) == (label, used)
-    assert (chosen.systematics is None) == (label == "none")
+    assert (chosen.pattern is None) == (label == "none")
     assert chosen.settings is ALIGNED
 
 
 def test_a_known_pattern_takes_the_place_of_most_of_the_models_error():
     (roll,) = (frame("TARGET", LIBRARY),)
-    preset = dr.GaussNewton.nircam("F444W", min_model_error=0.002)
-    assert choose_systematics([roll], (), model(), COARSE).settings == preset
-    limited = choose_systematics([roll], (), model(), COARSE, memory=2e9).settings
+    preset = dr.FitSettings.nircam("F444W", min_model_error=0.002)
+    assert choose_pattern([roll], (), model(), COARSE).settings == preset
+    limited = choose_pattern([roll], (), model(), COARSE, memory=2e9).settings
     assert limited == replace(preset, memory=2e9)
-    assert choose_systematics([roll], (), model(), COARSE, systematics="off").settings is None
+    assert choose_pattern([roll], (), model(), COARSE, pattern="off").settings is None
 
 
 @pytest.mark.parametrize(
@@ -374,19 +376,19 @@ def test_a_library_of_another_flat_field_is_replaced(cards, shown, references, l
     def fit(choice, again):
         assert again == bool(fitted)
         fitted.append(choice.label)
-        systematics = choice.systematics
-        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, systematics=systematics)
+        pattern = choice.pattern
+        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, pattern=pattern)
 
     others = [frame("REF", cards, shown=shown, seed=3 + k) for k in range(references)]
     given = rolls(cards, shown=shown), others, model(), COARSE
     choice, last = dr.pattern.fit_with_pattern(*given, fit, settings=ALIGNED)
     assert fitted == labels
-    assert last.systematics is choice.systematics
+    assert last.pattern is choice.pattern
 
 
 def test_rolls_share_an_unknown_pattern_where_nothing_is_known():
-    def chosen(*rolls, systematics="auto"):
-        return choose_systematics(rolls, [], model(), COARSE, systematics=systematics).systematics
+    def chosen(*rolls, pattern="auto"):
+        return choose_pattern(rolls, [], model(), COARSE, pattern=pattern).pattern
 
     roll, turned = rolls(ELSEWHERE)
     pattern = chosen(roll, turned)
@@ -403,14 +405,14 @@ def test_rolls_share_an_unknown_pattern_where_nothing_is_known():
     simulated = [replace(each, header=fits.Header()) for each in (roll, turned)]
     for frames in ([roll], [roll, roll], [roll, elsewhere], lost, simulated):
         assert chosen(*frames) is None
-    assert chosen(roll, turned, systematics="off") is None
+    assert chosen(roll, turned, pattern="off") is None
 
 
 @pytest.mark.parametrize("shown", [1.0, 0.0])
 def test_a_rough_fit_tells_which_pixels_a_frame_shows(shown, caplog):
     """Where it shows the pattern; otherwise the pattern is not used."""
     lost = replace(frame("TARGET", LIBRARY, shown=shown), first_pixel=None)
-    choice = choose_systematics([lost], [], model(), COARSE, settings=ALIGNED)
+    choice = choose_pattern([lost], [], model(), COARSE, settings=ALIGNED)
     assert (choice.label == f"library ({STARS})") == (shown > 0)
     assert choice.science[0].first_pixel == (PLACE if shown else None)
     assert ("is not seen in them; it is not used" in caplog.text) == (shown == 0)
@@ -423,7 +425,7 @@ def test_a_rough_fit_tells_which_pixels_a_frame_shows(shown, caplog):
 @cache
 def given():
     """The library's pattern of these pixels, as it is in the products of a reduction."""
-    return dr.known_systematics(frame("TARGET", SAME_FLAT))
+    return dr.known_pattern(frame("TARGET", SAME_FLAT))
 
 
 WRONG = [
@@ -447,24 +449,24 @@ def test_a_pattern_that_could_not_have_been_chosen_is_refused(cards, changes, me
         replace(each, **changes, header=fits.Header({**each.header, **cards}))
         for each in rolls(SAME_FLAT)
     )
-    systematics = dr.Systematics.read(given().write(tmp_path / "systematics.fits"))
+    pattern = dr.DetectorPattern.read(given().write(tmp_path / "pattern.fits"))
     with pytest.raises(errors.IncompatibleSetupError, match=message):
-        dr.refine(model(), [one, two], COARSE, systematics=systematics)
-    options = ReduceOptions(size=SIZE, systematics=tmp_path / "systematics.fits")
+        dr.refine(model(), [one, two], COARSE, pattern=pattern)
+    options = ReduceOptions(size=SIZE, pattern=tmp_path / "pattern.fits")
     with pytest.raises(errors.IncompatibleSetupError, match=message):
-        prepare(dr.Sequence(one.target, (one, two)), COARSE, options, model=model())
-    settings = dr.DiffrenderSettings(model=model(), systematics=systematics)
+        prepare(dr.ExposureSequence(one.target, (one, two)), COARSE, options, model=model())
+    settings = dr.pyklip_backend.DiffrenderSettings(model=model(), pattern=pattern)
     with pytest.raises(errors.IncompatibleSetupError, match=message):
         subtract_by_refinement(one, COARSE, settings)
 
 
 def test_what_a_pattern_does_not_say_is_a_remark(tmp_path, caplog):
     """Files of earlier versions name their stars, and neither their places nor the flat field."""
-    path = given().write(tmp_path / "systematics.fits")
+    path = given().write(tmp_path / "pattern.fits")
     with fits.open(path, mode="update") as hdus:
         for card in ("DETECTOR", "R_FLAT", "CATALOG"):
             del hdus["PATTERN"].header[card]
-    old = dr.Systematics.read(path)
+    old = dr.DetectorPattern.read(path)
     assert [star.names for star in old.stars] == [("HIP17695",), ("G-7-34",)]
     missing = "do not say it: detector, flat field"
     first, second = rolls(SAME_FLAT)
@@ -473,16 +475,16 @@ def test_what_a_pattern_does_not_say_is_a_remark(tmp_path, caplog):
     # The pattern reaches 9 of 32 columns.
     aside = replace(first, first_pixel=(PLACE[0] + 47, PLACE[1]))
     assert caveat(given(), aside) == "covers 28 % of the pixels"
-    sequence = dr.Sequence("TARGET", (first, second))
-    begun = prepare(sequence, COARSE, ReduceOptions(size=SIZE, systematics=old), model=model())
+    sequence = dr.ExposureSequence("TARGET", (first, second))
+    begun = prepare(sequence, COARSE, ReduceOptions(size=SIZE, pattern=old), model=model())
     assert missing in caplog.text
-    assert begun.options.systematics is old
+    assert begun.options.pattern is old
     same = replace(first, header=fits.Header({**first.header, "TARGPROP": "G 7-34"}))
     with pytest.raises(errors.IncompatibleSetupError, match="learned from frames of G 7-34"):
-        prepare(dr.Sequence("G 7-34", (same,)), COARSE, begun.options, model=model())
+        prepare(dr.ExposureSequence("G 7-34", (same,)), COARSE, begun.options, model=model())
     caplog.clear()
     foreign = dr.PatternLibrary((measured("A", filter="F356W"),))
-    prepare(sequence, COARSE, ReduceOptions(size=SIZE, systematics=foreign), model=model())
+    prepare(sequence, COARSE, ReduceOptions(size=SIZE, pattern=foreign), model=model())
     assert "none of the 1 patterns that were given" in caplog.text
 
 
@@ -493,17 +495,17 @@ def test_a_pattern_that_is_given_and_not_seen_is_refused(cards, fitted):
 
     def fit(choice, again):
         count.append(again)
-        systematics = choice.systematics
-        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, systematics=systematics)
+        pattern = choice.pattern
+        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, pattern=pattern)
 
-    arguments = {"settings": ALIGNED, "systematics": given()}
+    arguments = {"settings": ALIGNED, "pattern": given()}
     message = "shows less than half of the pattern 'HIP17695, G-7-34'. .*_0465.fits"
     with pytest.raises(errors.IncompatibleSetupError, match=message):
         dr.pattern.fit_with_pattern(rolls(cards, shown=0.0), (), model(), COARSE, fit, **arguments)
     assert len(count) == fitted
     shown = rolls(cards)
     choice, _ = dr.pattern.fit_with_pattern(shown, (), model(), COARSE, fit, **arguments)
-    assert choice.systematics is given()
+    assert choice.pattern is given()
     # Only one of two rolls has another flat field.
     if cards == OTHER_FLAT:
         mixed = [rolls(SAME_FLAT)[0], rolls(cards, shown=0.0)[1]]
@@ -514,11 +516,11 @@ def test_a_pattern_that_is_given_and_not_seen_is_refused(cards, fitted):
 
 def test_frames_are_moved_onto_the_pixels_of_a_pattern_that_is_given():
     lost, bare = (replace(frame("TARGET", LIBRARY, shown=k), first_pixel=None) for k in (1.0, 0.0))
-    arguments = {"settings": ALIGNED, "systematics": given()}
-    chosen = choose_systematics([lost], [], model(), COARSE, **arguments)
+    arguments = {"settings": ALIGNED, "pattern": given()}
+    chosen = choose_pattern([lost], [], model(), COARSE, **arguments)
     assert chosen.science[0].first_pixel == PLACE
     with pytest.raises(errors.IncompatibleSetupError, match="is not seen in these frames"):
-        choose_systematics([bare], [], model(), COARSE, **arguments)
+        choose_pattern([bare], [], model(), COARSE, **arguments)
 
 
 def test_products_in_place_of_other_files_are_named(tmp_path):
@@ -529,20 +531,20 @@ def test_products_in_place_of_other_files_are_named(tmp_path):
     products = {
         "a fit": fit.write(tmp_path / "fit.fits"),
         "a search": dr.detect(fit).write(tmp_path)[0],
-        "a flat-field pattern": given().write(tmp_path / "systematics.fits"),
-        "a library of flat-field patterns": known.write(tmp_path / "library.fits"),
+        "a detector pattern": given().write(tmp_path / "pattern.fits"),
+        "a library of detector patterns": known.write(tmp_path / "library.fits"),
     }
     for what, path in products.items():
-        words = f"{path.name}: this is no wavefront map, but {what}, a product of pyklip_diffrender"
+        words = f"{path.name}: this is no OPD map, but {what}, a product of pyklip_diffrender"
         with pytest.raises(errors.CorruptFileError, match=words):
             dr.read_opd(path)
         words = f"{path.name}: it is {what}, a product of pyklip_diffrender; expected frames"
         with pytest.raises(errors.NoValidPixelsError, match=words):
-            dr.Sequence.from_files(path)
+            dr.ExposureSequence.from_files(path)
         if "pattern" in what:
             assert as_request(path) is not None
             continue
-        with pytest.raises(errors.CorruptFileError, match=f"this is {what}, expected a flat-fie"):
+        with pytest.raises(errors.CorruptFileError, match=f"this is {what}, expected a detector"):
             as_request(path)
 
 
@@ -555,7 +557,7 @@ def test_patterns_of_several_flat_fields_and_set_ups_are_not_averaged():
     # Of reference stars and a library, the flat field of the frames decides.
     fit = dr.refine(model(), rolls(OTHER_FLAT), COARSE, settings=ALIGNED)
     for cards, stars in ((OTHER_FLAT, ["TARGET"]), (SAME_FLAT, ["HIP17695", "G-7-34"])):
-        assert dr.known_systematics(frame("NEW", cards), fit).provenance["stars"] == stars
+        assert dr.known_pattern(frame("NEW", cards), fit).provenance["stars"] == stars
 
 
 @pytest.mark.parametrize(
@@ -568,8 +570,8 @@ def test_patterns_of_several_flat_fields_and_set_ups_are_not_averaged():
 )
 def test_pyklip_chooses_as_a_reduction_does(cards, shown, label):
     """Simulations use no pattern by default."""
-    settings = dr.DiffrenderSettings(
-        model=model(), fit=ALIGNED, max_chi2=np.inf, keep_detected=False
+    settings = dr.pyklip_backend.DiffrenderSettings(
+        model=model(), settings=ALIGNED, max_chi2=np.inf, keep_detected=False
     )
     told = []
     # On simulations the pattern is an error of the model.
@@ -577,16 +579,16 @@ def test_pyklip_chooses_as_a_reduction_does(cards, shown, label):
     with warned:
         star = frame("TARGET", cards, shown=shown)
         result = subtract_by_refinement(star, COARSE, settings, tell=told.append)
-    assert result.systematics == label
-    refuted = any("without the library's flat-field pattern" in each for each in told)
+    assert result.pattern == label
+    refuted = any("without the library's detector pattern" in each for each in told)
     assert refuted == (bool(cards) and shown == 0)
 
 
 @pytest.mark.slow
 def test_a_reduction_keeps_the_references_that_it_fitted():
     references = tuple(frame("REF", LIBRARY, seed=k) for k in (3, 4))
-    sequence = dr.Sequence("TARGET", tuple(rolls(LIBRARY)), references)
-    result = dr.reduce(sequence, COARSE, size=24, settings=ALIGNED, systematics="references")
+    sequence = dr.ExposureSequence("TARGET", tuple(rolls(LIBRARY)), references)
+    result = dr.reduce(sequence, COARSE, size=24, settings=ALIGNED, pattern="references")
     assert [len(each.frames) for each in result.references] == [2]
-    assert result.systematics is result.fit.systematics
-    assert "REF" in result.systematics.provenance["stars"]
+    assert result.pattern is result.fit.pattern
+    assert "REF" in result.pattern.provenance["stars"]

@@ -64,8 +64,8 @@ def test_means_take_at_most_one_and_a_half_times_their_file(tmp_path, monkeypatc
     path, means = write(tmp_path), []
     frames = Observation.from_fits(path)  # What is imported and cached stays.
     assert len(frames) == MANY - 2
-    monkeypatch.setattr(files, "_IN_MEMORY", 2**18)
-    monkeypatch.setattr(integrations, "_AT_ONCE", 2**16)
+    monkeypatch.setattr(files, "_UNPACKED_IN_MEMORY_BYTES", 2**18)
+    monkeypatch.setattr(integrations, "_PIXELS_AT_A_TIME", 2**16)
     assert peak(lambda: means.append(Observation.means_from_fits(path))) < 1.5 * BYTES
     (means,) = means
     assert means.count == MANY - 2
@@ -92,7 +92,7 @@ def test_pyklip_datasets_take_about_twice_their_file(tmp_path, monkeypatch):
 
     from pyklip_diffrender.pyklip_backend import dataset_frames, source_frames
 
-    monkeypatch.setattr(integrations, "_AT_ONCE", 2**16)
+    monkeypatch.setattr(integrations, "_PIXELS_AT_A_TIME", 2**16)
     paths = [plain(tmp_path), calints(tmp_path / "warm.fits")]
     for path in paths:
         fits.setval(path, "CRVAL1", value=100.0, extname="SCI")
@@ -104,7 +104,7 @@ def test_pyklip_datasets_take_about_twice_their_file(tmp_path, monkeypatch):
 
     def gathered():
         dataset = datasets[-1]
-        settings = dr.DiffrenderSettings()
+        settings = dr.pyklip_backend.DiffrenderSettings()
         return dataset_frames.frames_of(dataset, np.arange(MANY), dataset.input, settings)
 
     dr.register(opd="flat")
@@ -114,7 +114,7 @@ def test_pyklip_datasets_take_about_twice_their_file(tmp_path, monkeypatch):
         with pytest.warns(DiffrenderWarning, match="left out"):
             assert peak(gathered) < 2.5 * BYTES
     finally:
-        dr.unregister()
+        dr.pyklip_backend.unregister()
     source = getattr(datasets[-1], source_frames.ATTRIBUTE)
     assert source.data.dtype == np.float32
     # A dataset keeps the means that a sequence has.

@@ -232,7 +232,7 @@ def test_few_cells_of_the_occulter_are_enough_for_a_round_mask(name, mask):
     frame = Observation.from_arrays(ones, ones, pixelscale=0.063, filter=name, header=header)
     model = dr.model_for(frame, npix=128, nlambda=3)
     fine = dr.model_for(frame, npix=128, nlambda=3, occulter_sampling=4.0)
-    opd = dr.random_opd(1, npix=128).data
+    opd = dr.wavefront.random_opd(1, npix=128).data
     for place in ((0.01, 0.02), (0.6, 0.3)):
         with torch.no_grad():
             image, expected = model(opd, place), fine(opd, place)

@@ -1,4 +1,4 @@
-"""Wavefront maps: units, broken and odd files, and the seeded generators."""
+"""OPD maps: units, broken and odd files, and the seeded generators."""
 
 import hashlib
 
@@ -23,10 +23,10 @@ from pyklip_diffrender.pyklip_backend.backend_settings import starting_opd
 from pyklip_diffrender.wavefront import (
     SegmentMotions,
     as_opd_map,
+    opd_for,
     random_drift,
     random_opd,
     read_opd,
-    wavefront_for,
 )
 
 NPIX = 96
@@ -66,7 +66,7 @@ def no_wavefront(values):
         (HOLES, "m", NonFiniteError, r"map\.fits: 3 values inside the pupil.*\(30, 40\)"),
         (np.stack([OPD, OPD]), "m", CorruptFileError, r"map\.fits.*two-dimensional"),
         (OPD[:, :90], "m", ShapeError, r"map\.fits.*\(96, 90\).*square"),
-        (np.ones((9, 9)), "MJy/sr", CorruptFileError, "no wavefront map, but an exposure of type"),
+        (np.ones((9, 9)), "MJy/sr", CorruptFileError, "no OPD map, but an exposure of type"),
         # Constants, the pupil itself, and another with wider struts.
         (0 * OPD, None, CorruptFileError, no_wavefront("value 0,")),
         (0 * OPD + 3e-8, "m", CorruptFileError, no_wavefront("value 3e-08,")),
@@ -124,7 +124,7 @@ def test_flat_stands_for_a_flat_wavefront(tmp_path, monkeypatch):
     flat = as_opd_map("flat")
     assert (flat.name, flat.date, flat.shape) == ("flat wavefront", None, (256, 256))
     assert not flat.data.any()
-    assert not wavefront_for("flat", None).data.any()
+    assert not opd_for("flat", None).data.any()
     assert not starting_opd(DiffrenderSettings(opd="flat"), None).data.any()
 
 

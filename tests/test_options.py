@@ -55,13 +55,13 @@ def test_the_docstring_describes_every_option():
 
 
 def test_settings_of_the_backend_are_unset_and_those_of_spaceklip_are_the_usual_ones():
-    settings = {each.name: each.default for each in fields(dr.DiffrenderSettings)}
+    settings = {each.name: each.default for each in fields(dr.pyklip_backend.DiffrenderSettings)}
     shared = settings.keys() & OPTIONS.keys()
     assert {"threshold", "disk", "star_flux_error"} < shared
     assert all(settings[name] is None for name in shared)
-    documented = " ".join((inspect.getdoc(dr.DiffrenderSettings) or "").split())
+    documented = " ".join((inspect.getdoc(dr.pyklip_backend.DiffrenderSettings) or "").split())
     # What differs from `reduce` is said there: the default, and where reference frames are from.
-    for name in shared - {"systematics", "max_chi2"}:
+    for name in shared - {"pattern", "max_chi2", "size"}:
         assert OPTIONS[name].meaning in documented
     for name, each in inspect.signature(run_obs).parameters.items():
         if name in OPTIONS and each.kind is not each.VAR_KEYWORD:

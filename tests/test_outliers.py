@@ -13,7 +13,7 @@ SIZE, NPIX, SCENE = 32, 64, 5
 PIXEL = (9, 21)
 """Row and column of the bad pixel, 0.55 arcsec from the star."""
 
-SETTINGS = dr.GaussNewton(cycles=6.0, response_npix=NPIX, companions_if_stalled=False)
+SETTINGS = dr.FitSettings(cycles=6.0, response_npix=NPIX, companions_if_stalled=False)
 """With a model error that is allowed for, fits do not look for companions by themselves."""
 
 
@@ -26,7 +26,7 @@ def model(name="F444W"):
 
 @cache
 def start():
-    return dr.random_opd(1, npix=NPIX)
+    return dr.wavefront.random_opd(1, npix=NPIX)
 
 
 def shot(*planets, seed=SCENE, name="F444W"):

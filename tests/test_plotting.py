@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import FourierModes
@@ -70,7 +70,7 @@ def frames(model):
 @pytest.fixture(scope="module")
 def fit(model, frames):
     companion = in_frame(ANGLES[0])
-    settings = GaussNewton(basis=FourierModes(2), response_npix=NPIX, companions=(companion,))
+    settings = FitSettings(basis=FourierModes(2), response_npix=NPIX, companions=(companion,))
     return dr.refine(model, frames, random_opd(3, npix=NPIX).data, settings=settings)
 
 

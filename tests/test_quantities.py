@@ -12,7 +12,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.wavefront import SegmentMotions, as_opd_map, random_drift
 
-OPD = dr.random_opd(1, npix=64).data
+OPD = dr.wavefront.random_opd(1, npix=64).data
 
 
 def coronagraph(**arguments):
@@ -44,7 +44,7 @@ def problem(**start):
 
 
 def prior(**arguments):
-    learned = dr.learn_prior(
+    learned = dr.wavefront.learn_prior(
         arguments["maps"], SegmentMotions(), npix=32, diameter=arguments["diameter"]
     )
     return sorted(learned.scales.values())
@@ -89,7 +89,9 @@ CASES = {
             ([3e-6, 4e-6, 6e-6], [1, 3, 2]),
         ),
     }),
-    "random_opd": (lambda rms: dr.random_opd(1, npix=32, rms=rms).data, {"rms": (50 * u.nm, 5e-8)}),
+    "random_opd": (lambda rms: dr.wavefront.random_opd(1, npix=32, rms=rms).data, {
+        "rms": (50 * u.nm, 5e-8),
+    }),
     "random_drift": (lambda hours: random_drift(1, hours, npix=32).data, {
         "hours": (90 * u.min, 1.5),
     }),
@@ -97,13 +99,13 @@ CASES = {
         "maps": ([OPD * 0 * u.m, OPD * 1e9 * u.nm], [OPD * 0, OPD]),
         "diameter": (660 * u.cm, 6.6),
     }),
-    "WavefrontPrior": (dr.WavefrontPrior, {
+    "WavefrontPrior": (dr.wavefront.WavefrontPrior, {
         "scales": (
             {"segment": 4e-9 * u.m, "texture": 1e-4 * u.um}, {"segment": 4.0, "texture": 0.1},
         ),
         "amplitude_scale": (2 * u.nm, 2.0),
     }),
-    "GaussNewton": (lambda **given: dr.GaussNewton(deviations=given).deviations, {
+    "FitSettings": (lambda **given: dr.FitSettings(deviations=given).deviations, {
         "star_offset": (3 * u.mas, 0.003),
         "lyot_rotation": (12 * u.arcmin, 0.2),
         "flux": (5 * u.percent, 0.05),
@@ -178,7 +180,7 @@ def test_another_dimension_is_refused_by_name(name):
         (lambda: dr.nircam_coronagraph(fov_arcsec=0), r"fov_arcsec: got 0 arcsec"),
         (lambda: dr.nircam_coronagraph(source=-5 * u.K), r"source: got -5 K"),
         (lambda: dr.reduce("nowhere", OPD, threshold=0), r"threshold: got 0, expected a pos"),
-        (lambda: dr.WavefrontPrior({"segment": -4}), r"scales: segment: got -4 nm"),
+        (lambda: dr.wavefront.WavefrontPrior({"segment": -4}), r"scales: segment: got -4 nm"),
     ],
 )
 def test_values_out_of_bounds_say_what_was_got_and_expected(call, words):
@@ -188,11 +190,11 @@ def test_values_out_of_bounds_say_what_was_got_and_expected(call, words):
 
 def test_memory_is_text_a_quantity_or_bytes():
     for memory in ("2 GB", "2000MB", 2 * u.Gbyte, 2e9):
-        assert dr.GaussNewton(memory=memory).memory == 2e9
-    assert dr.GaussNewton(memory="2 GiB").memory == 2 * 1024**3
-    assert dr.GaussNewton().memory is None
+        assert dr.FitSettings(memory=memory).memory == 2e9
+    assert dr.FitSettings(memory="2 GiB").memory == 2 * 1024**3
+    assert dr.FitSettings().memory is None
     for memory in ("much", "2", "2 m", 2 * u.m):
         with pytest.raises(UnitError, match="memory: got"):
-            dr.GaussNewton(memory=memory)
+            dr.FitSettings(memory=memory)
     with pytest.raises(IncompatibleSetupError, match="memory: got -1 byte"):
-        dr.GaussNewton(memory=-1)
+        dr.FitSettings(memory=-1)

@@ -167,14 +167,14 @@ def test_a_wrong_number_of_planets_is_refused_before_anything_is_read(count):
 def star_alone():
     """A star alone, of which the model is exact."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(), opd, seed=3)
-    return dr.detect(dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6)))
+    return dr.detect(dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=6)))
 
 
 def test_half_of_the_planets_at_the_limit_are_found():
     """Noise is Gaussian: S/N of planets at the limit is 5 on average, and symmetric about it."""
-    table = dr.completeness(
+    table = dr.detection.completeness(
         star_alone(), separations=[0.5] * u.arcsec, strengths=[0.5, 1.0, 2.0], angles=20
     )
     assert list(table["planets"]) == [20] * 3
@@ -207,4 +207,4 @@ def test_the_contrast_of_a_fraction_is_interpolated():
 def test_without_fits_there_is_no_completeness(tmp_path):
     path = next(each for each in star_alone().write(tmp_path) if each.suffix == ".fits")
     with pytest.raises(IncompatibleSetupError, match="without its fits"):
-        dr.completeness(dr.Detection.read(path))
+        dr.detection.completeness(dr.Detection.read(path))

@@ -14,7 +14,7 @@ from benchmarks.noisy_stars import READ_NOISE, DriftedStar, drifted_star
 from pyklip_diffrender import errors
 from pyklip_diffrender.instrument.jwst import maskrnd_openings
 from pyklip_diffrender.optics import PupilGrid, polygon_coverage
-from pyklip_diffrender.refinement import GaussNewton, Status, refine
+from pyklip_diffrender.refinement import FitSettings, Status, refine
 from pyklip_diffrender.refinement.fit_result import breakdown_explained
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions, random_opd
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -300,9 +300,9 @@ TURNED = dr.Observation.from_arrays(np.ones((20, 24)), np.ones((20, 24)), pixels
         ({"observation": TURNED}, errors.ShapeError, r"20 x 24.*24 x 20.*cutout"),
         ({"observation": "x.fits"}, errors.IncompatibleSetupError, "got 'x.fits', expected an Obs"),
         ({"observation": ["a.fits", "b.fits"]}, errors.IncompatibleSetupError,
-         r"got 'a\.fits'.*science of Sequence.from_files"),
-        ({"observation": dr.Sequence("HD 1", (TURNED,))}, errors.IncompatibleSetupError,
-         "got Sequence, expected an Observation"),
+         r"got 'a\.fits'.*science of ExposureSequence.from_files"),
+        ({"observation": dr.ExposureSequence("HD 1", (TURNED,))}, errors.IncompatibleSetupError,
+         "got ExposureSequence, expected an Observation"),
         ({"observation": np.ones((3, 3))}, errors.IncompatibleSetupError, "got ndarray"),
         ({"free": ("lyot_shfit",)}, errors.IncompatibleSetupError, r"'lyot_shfit'.*lyot_shift"),
     ],
@@ -329,7 +329,7 @@ def test_derivatives_from_far_away_do_not_end_a_fit():
     counts = rng.poisson(expected) + rng.normal(0, 42.0, expected.shape)
     error, scale = np.sqrt(np.maximum(counts, 0) + 42.0**2), system.detector.pixelscale
     frame = dr.Observation.from_arrays(counts, error, pixelscale=scale)
-    settings = GaussNewton(
+    settings = FitSettings(
         cycles=3.0, prior=WavefrontPrior({"segment": 20.0, "texture": 20.0}, fit_scales=False),
         response_npix=64, relinearise=0.3, accurate_steps=True,
     )  # fmt: skip

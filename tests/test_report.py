@@ -43,7 +43,7 @@ ROLL = 30.0
 def reduction(planet=True, target="HD 1"):
     """Of one frame, whose +y axis is at position angle 30 degrees."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    opd = replace(dr.random_opd(1, npix=128), date=Time("2022-10-01T12:00:00"))
+    opd = replace(dr.wavefront.random_opd(1, npix=128), date=Time("2022-10-01T12:00:00"))
     on_frame = replace(PLANET, position_angle=PLANET.position_angle - ROLL)
     scene = dr.Scene(dr.Star(exposure=20.0), (on_frame,) if planet else ())
     cards = {"TARGPROP": target, "INSTRUME": "TEST", "CRVAL1": 100.0, "CRVAL2": 20.0,
@@ -54,8 +54,8 @@ def reduction(planet=True, target="HD 1"):
         name="frame <1>.fits",
     )  # fmt: skip
     left_out = (("other & co.fits", "taken through F356W, not F444W"),)
-    sequence = dr.Sequence(target, (frame,), (), left_out)
-    fit = dr.refine(model, [frame], opd, settings=dr.GaussNewton(cycles=6))
+    sequence = dr.ExposureSequence(target, (frame,), (), left_out)
+    fit = dr.refine(model, [frame], opd, settings=dr.FitSettings(cycles=6))
     return dr.Reduction(sequence, fit, dr.detect(fit), failed=(("HD 2", "too faint"),))
 
 
@@ -63,7 +63,7 @@ def reduction(planet=True, target="HD 1"):
 def folder(tmp_path_factory):
     """Products whose pictures are no more than the beginning of one, as drawing takes seconds."""
     path = tmp_path_factory.mktemp("products")
-    for name in ("wide_field.fits", "systematics.fits"):
+    for name in ("wide_field.fits", "pattern.fits"):
         (path / name).write_text("of another star", encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"\x89PNG")
@@ -81,7 +81,7 @@ def sources(places):
 
 def test_products_of_another_reduction_are_removed(folder):
     assert not (folder / "wide_field.fits").exists()
-    assert not (folder / "systematics.fits").exists()
+    assert not (folder / "pattern.fits").exists()
     assert (folder / "fit.fits").exists()
 
 
@@ -286,22 +286,22 @@ def test_candidates_in_line_suggest_a_disk():
     said = summarise(crowded)
     assert said["sentence"].startswith("The candidates are in line with the star")
     assert {each["false_alarm_probability"] for each in said["candidates"]} == {None}
-    # So does a residual that is not explained by an unknown pattern of the flat field.
+    # So does a residual that is not explained by an unknown detector pattern.
     poor = replace(whole, fit=replace(whole.fit, chi2_per_pixel=9.0))
     flat = np.zeros((4, 4))
-    patterned = replace(poor, systematics=dr.Systematics(flat, flat, (1.0, 1.0), 0.02))
+    patterned = replace(poor, pattern=dr.DetectorPattern(flat, flat, (1.0, 1.0), 0.02))
     assert "far above the noise" in str(patterned)
     hopeless = replace(crowded, fit=replace(whole.fit, chi2_per_pixel=1.2e5))
     assert "the star is behind the mask where the header says" in hopeless.remark
     assert "disk=True" not in hopeless.remark
     # One candidate, an unknown pattern, or light of a disk that was fitted already.
     away = SimpleNamespace(offsets=np.array([[0.0, 0.9], [0.0, -0.9]]))
-    fitted = [replace(each, disk=cast(dr.Disk, away)) for each in (crowded, patterned)]
+    fitted = [replace(each, disk=cast(dr.detection.Disk, away)) for each in (crowded, patterned)]
     assert [each.remark for each in (whole, poor, *fitted)] == [""] * 4
     assert "disk" not in str(whole)
     # Sources of the disk 0.1 arcsec from one candidate, and at another.
     on_two = SimpleNamespace(offsets=np.array([[0.5, 0.1], [0.3, 0.01], [0.0, 0.9]]))
-    part = replace(crowded, disk=cast(dr.Disk, on_two)).remark
+    part = replace(crowded, disk=cast(dr.detection.Disk, on_two)).remark
     assert part.startswith("On the extended light, candidates at 0.30, 0.50 arcsec may be parts")
 
 
@@ -362,7 +362,7 @@ def test_the_summary_has_the_numbers_of_the_result(folder):
     assert summary["target"] == "HD 1"
     assert summary["status"]["name"] == result.fit.status.name
     assert summary["fit"]["reduced_chi2"] == result.fit.reduced_chi2
-    assert summary["wavefront_map"]["days_before_first_frame"] == pytest.approx(1.5)
+    assert summary["opd"]["days_before_first_frame"] == pytest.approx(1.5)
     assert [each["file"] for each in summary["frames"]] == ["frame <1>.fits"]
     reasons = [each["reason"] for each in summary["left_out"]]
     assert reasons == ["taken through F356W, not F444W", "too faint"]
@@ -381,13 +381,13 @@ def test_the_summary_has_the_numbers_of_the_result(folder):
     ("days", "chi2", "remarks"),
     [
         (6.9, 0.95, ()),
-        (-49.7, 0.95, ("The wavefront map was sensed 50 days after the frames.",)),
+        (-49.7, 0.95, ("The OPD map was sensed 50 days after the frames.",)),
         (49.7, 0.62, ("sensed 50 days before the frames.", "0.62; below 1 because the errors")),
     ],
 )
 def test_what_a_number_means_is_said_where_it_is_odd(days, chi2, remarks):
     summary = summarise(reduction())
-    summary["wavefront_map"]["days_before_first_frame"] = days
+    summary["opd"]["days_before_first_frame"] = days
     summary["fit"]["reduced_chi2"] = chi2
     text = page(summary, ReportPictures())
     assert all(each in text for each in remarks)
@@ -436,7 +436,7 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
 
 @pytest.mark.slow
 def test_a_header_cannot_write_into_the_page(tmp_path):
-    result = replace(shown()["Reduction"], systematics=None, failed=((HOSTILE, HOSTILE),))
+    result = replace(shown()["Reduction"], pattern=None, failed=((HOSTILE, HOSTILE),))
     html, data = write_report(result, tmp_path, [tmp_path / HOSTILE.replace("/", "")])
     text = html.read_text(encoding="utf-8")
     assert text.count(str(escape(HOSTILE))) > 8
@@ -653,20 +653,20 @@ def shown():
     whole = reduction()
     header = fits.Header({"TARGPROP": HOSTILE})
     evil = replace(whole.sequence.science[0], header=header, name=HOSTILE, filter=HOSTILE)
-    sequence = dr.Sequence(HOSTILE, (evil,), (), ((HOSTILE, HOSTILE),))
+    sequence = dr.ExposureSequence(HOSTILE, (evil,), (), ((HOSTILE, HOSTILE),))
     part = replace(whole.fit.frames[0], observation=evil)
     fit = replace(whole.fit, frames=(part,), initial=replace(whole.fit.initial, name=HOSTILE))
     flat = np.zeros((4, 4))
-    known = dr.Systematics(
+    known = dr.DetectorPattern(
         flat, flat, (1.0, 1.0), 0.02, name=HOSTILE, filter=HOSTILE, provenance={"stars": [HOSTILE]}
     )
     detection = replace(whole.detection, fits=(fit,))
-    again = replace(whole, sequence=sequence, fit=fit, detection=detection, systematics=known)
-    wide = dr.WideField(
+    again = replace(whole, sequence=sequence, fit=fit, detection=detection, pattern=known)
+    wide = dr.detection.WideField(
         detection, 5.0, flat, flat, flat, flat, detection.error_factor, detection.candidates,
         detection.contrast_curve,
     )  # fmt: skip
-    disk = dr.Disk(fit, (), flat, flat, flat, np.ones((1, 2)), np.ones(1), flat > 1, 9.0)
+    disk = dr.detection.Disk(fit, (), flat, flat, flat, np.ones((1, 2)), np.ones(1), flat > 1, 9.0)
     values = (evil, sequence, fit, detection, again, whole.fit.model, known, fit.initial,
               wide, disk)  # fmt: skip
     return {type(value).__name__: value for value in values}
@@ -748,7 +748,7 @@ def test_the_search_of_whole_frames_has_a_section_of_its_own(tmp_path):
     for name in ("fwhm_major", "fwhm_minor"):
         table[name] = np.nan * u.arcsec
     table["axis_angle"] = np.nan * u.deg
-    wide = dr.WideField(
+    wide = dr.detection.WideField(
         inner, 5.0, inner.contrast, inner.error, inner.snr, inner.grid, inner.error_factor, table,
         inner.contrast_curve,
     )  # fmt: skip

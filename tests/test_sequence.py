@@ -11,12 +11,12 @@ import pyklip_diffrender as dr
 from benchmarks.calints_files import CENTER, calints
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.headers import same_name
-from pyklip_diffrender.pattern import learn_systematics
-from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
-from pyklip_diffrender.scene import Observation, Scene, Sequence, Star, simulate
+from pyklip_diffrender.pattern import learn_pattern
+from pyklip_diffrender.refinement import FitSettings, Refinement, refine
+from pyklip_diffrender.scene import ExposureSequence, Observation, Scene, Star, simulate
 
 SIZE = 32
-SETTINGS = GaussNewton(cycles=6)
+SETTINGS = FitSettings(cycles=6)
 
 
 @cache
@@ -26,7 +26,7 @@ def model():
 
 @cache
 def opd():
-    return dr.random_opd(1, npix=64)
+    return dr.wavefront.random_opd(1, npix=64)
 
 
 def pattern():
@@ -59,10 +59,12 @@ def test_rolls_are_cut_alike_if_their_stars_are_on_nearly_the_same_pixel():
         )
         for shift in (0.4, 0.6, 7.0)
     ]
-    cut = Sequence("star", tuple(rolls)).cutout(10)
+    cut = ExposureSequence("star", tuple(rolls)).cutout(10)
     corners = [(611, 1610), (611, 1610), (618, 1610)]
     assert [roll.cutout(10).first_pixel for roll in rolls] == corners
-    near = Sequence("star", (rolls[0], replace(rolls[1], center=rolls[1].center + 0.6))).cutout(10)
+    near = ExposureSequence(
+        "star", (rolls[0], replace(rolls[1], center=rolls[1].center + 0.6))
+    ).cutout(10)
     assert near.science[1].first_pixel == near.science[0].first_pixel == (611, 1610)
     np.testing.assert_allclose(near.science[1].center, [[5.2, 5.2]])
     assert near.science[1].data[0, 0, 0] == rolls[1].data[0, 10, 11]
@@ -97,18 +99,18 @@ def test_a_target_that_cannot_be_decided_is_an_error(tmp_path, arguments, words)
     calints(tmp_path / "a.fits", "AU MIC")
     calints(tmp_path / "b.fits", "HIP1", observation=2, cards={"TARG_RA": 20.0})
     with pytest.raises(IncompatibleSetupError, match=words):
-        Sequence.from_files(tmp_path, **arguments)
+        ExposureSequence.from_files(tmp_path, **arguments)
 
 
 def test_a_filter_is_needed_where_files_have_several(tmp_path):
     with pytest.raises(NoValidPixelsError, match="no FITS files"):
-        Sequence.from_files(tmp_path)
+        ExposureSequence.from_files(tmp_path)
     with pytest.raises(IncompatibleSetupError, match="got a int, expected paths of FITS files"):
-        Sequence.from_files(3)
+        ExposureSequence.from_files(3)
     for k, name in enumerate(("F356W", "F444W")):
         calints(tmp_path / f"{name}.fits", observation=k, cards={"FILTER": name})
     with pytest.raises(IncompatibleSetupError, match=r"filter: the files have .*F356W"):
-        Sequence.from_files(tmp_path)
+        ExposureSequence.from_files(tmp_path)
 
 
 def read(path, offsets=None, **cards):
@@ -168,12 +170,12 @@ def test_real_stars_are_off_the_mask_by_what_the_files_say(shared_data):
 def test_a_pattern_is_learned_from_another_star():
     fit = reference_fit()
     assert fit.chi2_per_pixel > 5
-    learned = learn_systematics(fit)
+    learned = learn_pattern(fit)
     truth = pattern()
     y, x = np.indices(truth.shape) - (SIZE - 1) / 2
     bright = np.hypot(x, y) < 12
     # What looks like wavefront is not in the pattern: most of it is not, and is recovered.
-    assert np.corrcoef(learned.pattern[bright], truth[bright])[0, 1] > 0.8
+    assert np.corrcoef(learned.value[bright], truth[bright])[0, 1] > 0.8
     assert learned.unknown == pytest.approx(0.05, rel=0.5)
     assert learned.filter == "F444W"
 
@@ -181,25 +183,25 @@ def test_a_pattern_is_learned_from_another_star():
 def test_a_pattern_needs_two_frames_of_one_filter():
     single = replace(reference_fit(), frames=reference_fit().frames[:1])
     with pytest.raises(IncompatibleSetupError, match="at least two"):
-        learn_systematics(single)
+        learn_pattern(single)
 
 
-def test_systematics_survive_the_file(tmp_path):
-    learned = learn_systematics(reference_fit(), name="spring")
-    back = dr.Systematics.read(learned.write(tmp_path / "pattern.fits"))
-    for name in ("pattern", "error", "center", "unknown", "filter", "name"):
+def test_a_pattern_survives_the_file(tmp_path):
+    learned = learn_pattern(reference_fit(), name="spring")
+    back = dr.DetectorPattern.read(learned.write(tmp_path / "pattern.fits"))
+    for name in ("value", "error", "center", "unknown", "filter", "name"):
         np.testing.assert_array_equal(getattr(back, name), getattr(learned, name))
     assert (back.name, back.provenance["stars"]) == ("spring", ["REF"])
     fits.PrimaryHDU().writeto(tmp_path / "other.fits")
-    with pytest.raises(CorruptFileError, match="systematics"):
-        dr.Systematics.read(tmp_path / "other.fits")
+    with pytest.raises(CorruptFileError, match="pattern"):
+        dr.DetectorPattern.read(tmp_path / "other.fits")
 
 
 def test_a_refinement_survives_the_file(tmp_path):
     frames = [frame("TARGET", 20), frame("TARGET", 21, roll=10.0)]
     assert frames[1].roll_from(frames[0]) == pytest.approx(-10)
-    learned = learn_systematics(reference_fit())
-    fit = refine(model(), frames, opd(), settings=SETTINGS, systematics=learned)
+    learned = learn_pattern(reference_fit())
+    fit = refine(model(), frames, opd(), settings=SETTINGS, pattern=learned)
     # With the pattern of the other star, the frames are explained.
     assert fit.chi2_per_pixel < 2
     one, two = fit.frames
@@ -224,7 +226,7 @@ def test_a_refinement_survives_the_file(tmp_path):
     np.testing.assert_array_equal(again["contrast_error"], first["contrast_error"])
 
 
-def test_reduce_says_what_systematics_it_takes():
-    sequence = Sequence("TARGET", (frame("TARGET", 20),))
+def test_reduce_says_what_patterns_it_takes():
+    sequence = ExposureSequence("TARGET", (frame("TARGET", 20),))
     with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'references'"):
-        dr.reduce(sequence, opd(), size=SIZE, systematics="maybe")
+        dr.reduce(sequence, opd(), size=SIZE, pattern="maybe")

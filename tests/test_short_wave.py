@@ -13,8 +13,8 @@ from astropy.io import fits
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.instrument import detector_place, filter_shift, nircam_coronagraph
 from pyklip_diffrender.reduction import reduce
-from pyklip_diffrender.refinement import GaussNewton, refine, settings_for
-from pyklip_diffrender.scene import Observation, Planet, Sequence, model_for
+from pyklip_diffrender.refinement import FitSettings, refine, settings_for
+from pyklip_diffrender.scene import ExposureSequence, Observation, Planet, model_for
 from pyklip_diffrender.scene.aligned_frames import mask_place
 from pyklip_diffrender.wavefront import random_opd
 
@@ -68,11 +68,11 @@ def calints(folder, filter="F210M", module="A"):
 @pytest.mark.slow
 @pytest.mark.parametrize(("filter", "module"), [("F210M", "A"), ("F444W", "B")])
 def test_a_planet_is_where_it_is_and_nothing_else(tmp_path, filter, module):
-    """A map that is 5 nm rms off, a star and a stop off their places, and no flat-field pattern."""
-    settings = GaussNewton.nircam(filter, module=module, cycles=(7.0,), max_iterations=10)
+    """A map that is 5 nm rms off, a star and a stop off their places, and no detector pattern."""
+    settings = FitSettings.nircam(filter, module=module, cycles=(7.0,), max_iterations=10)
     frame, opd = calints(tmp_path, filter, module), random_opd(1, npix=256)
     result = reduce([frame], opd, size=SIZE, settings=settings)
-    assert result.systematics is None
+    assert result.pattern is None
     assert result.fit is result.detection.fits[0]
     assert len(result.fit.companions) == 1
     table = result.detection.candidates
@@ -84,7 +84,7 @@ def test_a_planet_is_where_it_is_and_nothing_else(tmp_path, filter, module):
 
 
 def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path):
-    (frame,) = Sequence.from_files([calints(tmp_path)]).science
+    (frame,) = ExposureSequence.from_files([calints(tmp_path)]).science
     assert frame.first_pixel is not None  # The star is where the mask is on NRCA2.
     model = model_for(frame, SIZE)
     place = detector_place("MASK335R", "F210M")
@@ -92,7 +92,7 @@ def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path):
     assert model.detector.pixelscale == place.siaf_pixelscale
     assert model.between[0].name == "MASK335R"
     assert not model.defaults
-    long = GaussNewton.nircam("F444W")
+    long = FitSettings.nircam("F444W")
     short = settings_for(frame)
     assert short.cycles == long.cycles == (18.0,)
     assert short.deviations["lyot_shift"] > 2 * long.deviations["lyot_shift"]
@@ -108,7 +108,7 @@ def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path):
 def test_frames_of_module_b_have_its_model(tmp_path):
     """Nothing that was measured in flight with module A is taken for it."""
     path = calints(tmp_path, "F444W", "B")
-    (frame,) = Sequence.from_files([path]).science
+    (frame,) = ExposureSequence.from_files([path]).science
     assert frame.header["DETECTOR"] == "NRCBLONG"
     model = model_for(frame, SIZE)
     assert model.setup["module"] == "B"
@@ -116,7 +116,7 @@ def test_frames_of_module_b_have_its_model(tmp_path):
     assert model.detector.pixelscale == place.siaf_pixelscale
     assert not model.defaults
     assert mask_place(frame.header, frame.name) is None
-    known = GaussNewton.nircam("F444W").deviations["lyot_shift"]
+    known = FitSettings.nircam("F444W").deviations["lyot_shift"]
     assert settings_for(frame).deviations["lyot_shift"] > 2 * known
     with pytest.raises(IncompatibleSetupError, match="have module B, the model A"):
         refine(nircam_coronagraph("F444W", npix=128, fov_pixels=64), [frame], "flat")
@@ -129,7 +129,7 @@ def test_frames_of_module_b_have_its_model(tmp_path):
 
 def test_what_is_not_modelled_is_refused(tmp_path):
     path = calints(tmp_path)
-    (frame,) = Sequence.from_files([path]).science
+    (frame,) = ExposureSequence.from_files([path]).science
     frame.header["DETECTOR"] = "NRCA4"
     with pytest.raises(IncompatibleSetupError, match=r"detector NRCA4, expected NRCA2"):
         model_for(frame, SIZE)
@@ -141,7 +141,7 @@ def test_what_is_not_modelled_is_refused(tmp_path):
         model_for(frame, SIZE)
     fits.setval(path, "INSTRUME", value="MIRI")
     with pytest.raises(NoValidPixelsError, match="taken with MIRI; only NIRCam"):
-        Sequence.from_files([path])
+        ExposureSequence.from_files([path])
 
 
 def test_the_place_along_a_bar_is_that_of_the_header():
@@ -152,7 +152,7 @@ def test_the_place_along_a_bar_is_that_of_the_header():
     model = model_for(frame, monochromatic=3.35e-6)
     assert model.setup["pupil_mask"] == "MASKBAR"
     assert not model.defaults  # This stop was not measured in flight.
-    known = GaussNewton.nircam("F335M").deviations["lyot_rotation"]
+    known = FitSettings.nircam("F335M").deviations["lyot_rotation"]
     assert settings_for(frame).deviations["lyot_rotation"] > 2 * known
     # The narrow end is 8.3 arcsec from the middle of a bar of 20.
     assert model.between[0].reach[0] == pytest.approx(18.30, abs=0.01)

@@ -8,7 +8,7 @@ from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.refinement import GaussNewton, refine
+from pyklip_diffrender.refinement import FitSettings, refine
 from pyklip_diffrender.scene import (
     ALPHA_PICTORIS_W2,
     UNOCCULTED_PEAK,
@@ -111,7 +111,7 @@ def test_planets_whose_copies_would_be_in_the_field_are_refused(model, opd):
         scene = Scene(planets=(Planet(1e-3, separation, 90.0),))
         with pytest.raises(IncompatibleSetupError, match=r"scene: got a planet at .* 500 \* u.mas"):
             simulate(model, scene, opd, seed=1)
-        settings = GaussNewton(cycles=6, companions=scene.planets)
+        settings = FitSettings(cycles=6, companions=scene.planets)
         frame = simulate(model, Scene(), opd, seed=1)
         with pytest.raises(IncompatibleSetupError, match=r"companions: got a planet at"):
             refine(model, frame, opd, settings=settings)

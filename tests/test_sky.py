@@ -327,7 +327,7 @@ def fitted(observation):
 
 
 def sky_of(*frames, catalogue_error=None, scatter=1.0):
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     fit = SimpleNamespace(
         frames=frames, catalogue_error=catalogue_error, catalogue_flux=None, initial=opd
     )

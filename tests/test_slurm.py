@@ -35,7 +35,7 @@ def test_a_survey_runs_in_jobs_of_slurm(tmp_path, shared_data):
         f"""
         [options]
         size = 24
-        systematics = "off"
+        pattern = "off"
         settings = {{ cycles = [4.0], max_iterations = 3, accurate_steps = false }}
         [[sequence]]
         files = "{shared_data / "hip65426_f444w_calints.fits.gz"}"

@@ -21,7 +21,7 @@ from pyklip_diffrender.detection.measurement import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import backend
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.spaceklip import database_files, run
 from pyklip_diffrender.wavefront import random_opd
 
@@ -32,7 +32,7 @@ KEY = "JWST_NIRCAM_NRCALONG_F444W_MASKRND_MASK335R_SUB320A335R"
 FLUX, CONTRAST = 1e10, 2e-5
 SKY_ANGLES = (63.0, 73.0)
 OPD = random_opd(1, npix=128)
-ALIGNED = GaussNewton(free=("flux", "background"), wavefront=False)
+ALIGNED = FitSettings(free=("flux", "background"), wavefront=False)
 
 
 class StandIn:
@@ -311,7 +311,7 @@ def test_a_concatenation_from_frames_to_sources(kind, tmp_path, request):
     database = request.getfixturevalue("real_database") if real else StandIn(tmp_path, {})
     database.obs[KEY] = concatenation(files)
     detections = spaceklip.run_obs(
-        database, opd=OPD, model=model, systematics="off", fit=ALIGNED, save_rolls=True,
+        database, opd=OPD, model=model, pattern="off", settings=ALIGNED, save_rolls=True,
         image="subtracted",
     )  # fmt: skip
     assert list(detections) == list(database.red) == [KEY]
@@ -354,7 +354,7 @@ def test_a_flux_of_no_filter_is_refused(tmp_path):
     [
         ({"fit_pixel": 80}, TypeError, "unexpected keyword argument 'fit_pixel'"),
         ({"model_options": {"npx": 8}}, IncompatibleSetupError, "npx: not known to nircam_cor"),
-        ({"systematics": "no.fits"}, IncompatibleSetupError, "systematics: got 'no.fits'"),
+        ({"pattern": "no.fits"}, IncompatibleSetupError, "pattern: got 'no.fits'"),
         ({"threshold": 0.0}, IncompatibleSetupError, "threshold: got 0.0"),
     ],
 )
@@ -378,7 +378,7 @@ def test_spaceklips_own_subtraction(tmp_path, monkeypatch, real_database):
     table["ROLL_REF"], reference["ROLL_REF"] = SKY_ANGLES, [0.0]
     real_database.obs[KEY] = vstack([table, reference])
     monkeypatch.setattr(pipeline, "get_transmission", lambda *args: None, raising=False)
-    with backend(opd=OPD, model=model, systematics="off", fit=ALIGNED):
+    with backend(opd=OPD, model=model, pattern="off", settings=ALIGNED):
         modes = {"mode": ["ADI+RDI"], "annuli": [1], "subsections": [1], "numbasis": [1]}
         options = {**modes, "algo": "diffrender", "save_rolls": True}
         pipeline.run_obs(real_database, kwargs=options, subdir="own")

@@ -169,7 +169,9 @@ def test_one_star_in_every_format(tmp_path, kind, packed):
     reference = tmp_path / "reference.txt"
     text("", MICRON, JANSKY)(reference)
     for filter in ("F200W", "F356W", "F444W"):
-        same = dr.star_flux_density(path, filter) / dr.star_flux_density(reference, filter)
+        same = dr.instrument.star_flux_density(path, filter) / dr.instrument.star_flux_density(
+            reference, filter
+        )
         assert same.value == pytest.approx(1, rel=1e-6)
 
 
@@ -243,7 +245,7 @@ def test_what_is_not_clear_or_cannot_be_true_is_refused(tmp_path, heading, colum
     path = tmp_path / "star.txt"
     text(heading, *columns)(path)
     with pytest.raises(IncompatibleSetupError) as refused:
-        dr.star_flux_density(path, "F444W")
+        dr.instrument.star_flux_density(path, "F444W")
     message = str(refused.value)
     assert message.startswith(f"{path}: ")
     assert [word for word in words if word not in message] == []

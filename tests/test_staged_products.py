@@ -30,14 +30,14 @@ PLANET = dr.Planet(2e-4, 0.5, 40.0)
 def preparation(**options):
     """One small frame of a star with a planet, and what is needed to reduce it."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     frame = replace(
         dr.simulate(model, dr.Scene(planets=(PLANET,)), opd, seed=3),
         header=fits.Header(POINTING), position_angles=np.array([ROLL]), name="roll1_calints.fits",
     )  # fmt: skip
-    sequence = dr.Sequence("HD 1", (frame,))
+    sequence = dr.ExposureSequence("HD 1", (frame,))
     chosen = ReduceOptions(
-        size=24, systematics="off", settings=dr.GaussNewton(cycles=4), injections=2, **options
+        size=24, pattern="off", settings=dr.FitSettings(cycles=4), injections=2, **options
     )
     return Preparation(sequence, sequence, model, opd, chosen, chosen.settings)
 
@@ -194,6 +194,6 @@ def test_a_quick_reduction_is_smaller_and_coarser_where_the_star_is_fainter():
     assert coarse_arguments(bright, (80, 80)) == {"nlambda": 7, "npix": 128}
     assert coarse_arguments(faint, (80, 80))["nlambda"] == 3
     assert coarse_arguments(bright, (320, 80))["npix"] == 256
-    for wrong in ({"accuracy": "fast"}, {"accuracy": "quick", "settings": dr.GaussNewton()}):
+    for wrong in ({"accuracy": "fast"}, {"accuracy": "quick", "settings": dr.FitSettings()}):
         with pytest.raises(IncompatibleSetupError, match="accuracy"):
             ReduceOptions(**wrong)

@@ -24,11 +24,11 @@ PLANET = dr.Planet(3e-5, 0.6, 120.0)
 def fit():
     """A simulated star and planet, with the header of a calibrated frame."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(planets=(PLANET,)), opd, seed=3)
     header = fits.Header({"INSTRUME": "NIRCAM", "PIXAR_SR": 9.2e-14})
     frame = replace(frame, unit=u.MJy / u.sr, header=header)
-    return dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
+    return dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=6))
 
 
 def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit):
@@ -66,7 +66,7 @@ def test_without_a_map_the_star_is_less_certain(fit, caplog):
     # A reduction says so, unless the flux is given.
     header = fit.frames[0].observation.header.copy()
     header["CORONMSK"] = "MASKA335R"
-    sequence = dr.Sequence("A STAR", (with_header(fit, header)[1],))
+    sequence = dr.ExposureSequence("A STAR", (with_header(fit, header)[1],))
     cases = (("flat", None, True), ("flat", 0.4, False), (fit.initial, None, False))
     for opd, flux, warned in cases:
         caplog.clear()
@@ -145,12 +145,12 @@ def test_a_flux_within_a_factor_of_three_is_taken(fit, factor, map_, status):
 def test_a_reduction_finds_a_mistaken_unit_before_the_wavefront_is_fitted(fit, caplog):
     cards = {"INSTRUME": "NIRCAM", "PIXAR_SR": 9.2e-19, "CORONMSK": "MASKA335R"}
     fit, frame = with_header(fit, fits.Header(cards))
-    sequence = dr.Sequence("A STAR", (frame,))
+    sequence = dr.ExposureSequence("A STAR", (frame,))
     seen = jansky_per_unit(fit.frames[0]) * fit.frames[0].flux
     caplog.set_level("INFO")
     for factor, stages in ((1000, []), (5, ["1. wavefront"])):
         options = ReduceOptions(
-            star_flux=factor * seen, systematics="off", settings=dr.GaussNewton(cycles=6)
+            star_flux=factor * seen, pattern="off", settings=dr.FitSettings(cycles=6)
         )
         with pytest.raises(IncompatibleSetupError, match=r"star_flux: got"):
             prepare(sequence, fit.initial, options, model=fit.model).run()
@@ -163,14 +163,14 @@ def test_frames_without_calibration_are_refused_before_the_fit(fit):
     bare, observation = with_header(fit, fits.Header({"INSTRUME": "NIRCAM"}))
     with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
         with_star_flux(bare, 0.4, 0.03)
-    sequence = dr.Sequence("a star", (observation,))
+    sequence = dr.ExposureSequence("a star", (observation,))
     with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
         dr.reduce(sequence, fit.initial, size=16, star_flux="0.4 Jy")
 
 
 @pytest.mark.parametrize("error", [0.0, math.nan])
 def test_errors_that_are_not_positive_are_refused(fit, error):
-    sequence = dr.Sequence("a star", (fit.frames[0].observation,))
+    sequence = dr.ExposureSequence("a star", (fit.frames[0].observation,))
     with pytest.raises((IncompatibleSetupError, UnitError, ValueError), match="star_flux_error"):
         dr.reduce(sequence, fit.initial, star_flux=0.4, star_flux_error=error)
 
@@ -225,7 +225,7 @@ def as_photometry(path):
 @pytest.mark.parametrize("filter", ["F200W", "F444W"])
 def test_power_law_in_every_format(tmp_path, write, kind, filter):
     write(tmp_path / f"star.{kind}")
-    flux = dr.star_flux_density(tmp_path / f"star.{kind}", filter)
+    flux = dr.instrument.star_flux_density(tmp_path / f"star.{kind}", filter)
     # The package interpolates power laws exactly; what remains are the two quadratures.
     assert flux.to_value(u.Jy) == pytest.approx(expected(filter), rel=1e-4)
 
@@ -247,7 +247,7 @@ def test_files_that_do_not_say_the_flux(tmp_path, text, expected, complaint):
     path = tmp_path / "star.txt"
     path.write_text(text)
     with pytest.raises(expected, match=complaint):
-        dr.star_flux_density(path, "F444W")
+        dr.instrument.star_flux_density(path, "F444W")
 
 
 def test_spectral_type():
@@ -256,14 +256,19 @@ def test_spectral_type():
     flux = wavelength**-3 / np.expm1(14388 / (wavelength * 9600))
     for filter, ratio in zip(("F210M", "F356W", "F444W"), flux[1:] / flux[0], strict=True):
         expected = 666.8 * ratio
-        assert dr.star_flux_density("A0V, K=0", filter).value == pytest.approx(expected, rel=0.02)
+        assert dr.instrument.star_flux_density("A0V, K=0", filter).value == pytest.approx(
+            expected, rel=0.02
+        )
     # A magnitude is a factor of 2.512; other ways to write it mean the same.
-    bright, faint = (dr.star_flux_density(f"M4, K={k}", "F356W").value for k in ("5", "6.0"))
+    bright, faint = (
+        dr.instrument.star_flux_density(f"M4, K={k}", "F356W").value for k in ("5", "6.0")
+    )
     assert bright / faint == pytest.approx(10**0.4)
-    assert dr.star_flux_density("M4V,K=5", "F356W").value == bright
+    assert dr.instrument.star_flux_density("M4V,K=5", "F356W").value == bright
     # Between K5 and M5 the table has no W1 - W2; it has to increase from one to the other.
     ratio = [
-        dr.star_flux_density(star, "F460M") / dr.star_flux_density(star, "F356W")
+        dr.instrument.star_flux_density(star, "F460M")
+        / dr.instrument.star_flux_density(star, "F356W")
         for star in ("K5V, K=5", "M0V, K=5", "M2.5V, K=5", "M5V, K=5")
     ]
     assert np.all(np.diff(ratio) > 0)
@@ -280,4 +285,4 @@ def test_spectral_type():
 )
 def test_stars_that_are_not_known(star, filter, expected, complaint):
     with pytest.raises(expected, match=complaint):
-        dr.star_flux_density(star, filter)
+        dr.instrument.star_flux_density(star, filter)

@@ -17,7 +17,7 @@ from pyklip_diffrender.pattern import PatternLibrary, package_library
 from pyklip_diffrender.scene.admission import exposures_in
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.jobs import jobs_of
-from pyklip_diffrender.wavefront import choose_map, random_opd
+from pyklip_diffrender.wavefront import choose_opd, random_opd
 
 SUFFIXES = (".fits", ".fit", ".fts", ".FITS", ".Fit", ".fits.gz", ".FITS.GZ", ".fit.gz", ".fits.fz")
 MARK = "\N{ZERO WIDTH NO-BREAK SPACE}"
@@ -59,7 +59,7 @@ def map_of(folder, suffix):
     data, header = random_opd(1, npix=32).data * 1e9, fits.Header({"BUNIT": "nm"})
     fits.writeto(folder / "opd_2022-08-01.fits", data, header)
     renamed(folder / "opd_2022-08-01.fits", suffix)
-    return choose_map(folder, "2022-08-02").data.std()
+    return choose_opd(folder, "2022-08-02").data.std()
 
 
 def library_of(folder, suffix):
@@ -99,7 +99,7 @@ def test_other_files_are_no_fits_files(tmp_path):
 def test_a_file_and_its_packed_copy_are_one(tmp_path, packed):
     copy = renamed(calints(tmp_path / "a_calints.fits"), packed)
     path = calints(tmp_path / "a_calints.fits")
-    sequence = dr.Sequence.from_files([path, copy])
+    sequence = dr.ExposureSequence.from_files([path, copy])
     assert len(sequence.science) == 1
     assert "the same file as a_calints" in sequence.excluded[0][1]
 

@@ -126,8 +126,8 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
         ((1,), "name", "two\nlines", ["sequence 2: name", "printable"]),
         ((1,), "size", 4, ["sequence 2: size", "8 or more"]),
         ((1,), "threshold", 10**400, ["sequence 2: threshold", "positive"]),
-        ((1,), "systematics", __file__, ["sequence 2: systematics", "test_survey", "patterns"]),
-        ((1,), "systematics", "no.fits", ["sequence 2: systematics", "'no.fits'", "references"]),
+        ((1,), "pattern", __file__, ["sequence 2: pattern", "test_survey", "patterns"]),
+        ((1,), "pattern", "no.fits", ["sequence 2: pattern", "'no.fits'", "references"]),
         ((1,), "injections", {**PLANETS, "separations": [2.0]}, ["sequence 2", "less than 1.3"]),
         ((1,), "code", "import os", ["sequence 2: got the key 'code'", "one of files"]),
     ],
@@ -169,7 +169,7 @@ def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path):
     jobs = planned(config)
     assert [each.name for each in jobs] == ["HD 1 2022-10-03"] * 2 + ["HD 1 2023-12-01"] * 2
     assert len({each.key for each in jobs}) == 4
-    epochs = [dr.Sequence.from_files(job.files, epoch=job.epoch) for job in jobs[::2]]
+    epochs = [dr.ExposureSequence.from_files(job.files, epoch=job.epoch) for job in jobs[::2]]
     chosen = [[each.name for each in epoch.science] for epoch in epochs]
     assert chosen == [["0.fits", "1.fits"], ["2.fits"]]
     assert jobs[3].epoch == jobs[2].epoch
@@ -183,7 +183,7 @@ def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path):
     config = inputs(tmp_path, 1)
     maps, frames = tmp_path / "maps", tmp_path / "frames"
     maps.mkdir()
-    opd = dr.random_opd(1, npix=16).data
+    opd = dr.wavefront.random_opd(1, npix=16).data
     for day in ("01", "11", "29"):
         header = fits.Header({"BUNIT": "m", "DATE-OBS": f"2022-08-{day}T00:00:00"})
         fits.writeto(maps / f"map{day}.fits", opd, header)
@@ -590,11 +590,13 @@ def test_an_interrupted_command_says_that_it_can_go_on(tmp_path, command, capsys
 @pytest.mark.slow
 def test_files_with_and_without_a_planet(tmp_path):
     """From calibrated files to the tables; test_slurm.py has a job with a real frame."""
-    first = dr.Sequence.from_files([calints(tmp_path / "blank_calints.fits")]).science[0]
+    first = dr.ExposureSequence.from_files([calints(tmp_path / "blank_calints.fits")]).science[0]
     model = dr.model_for(first, 41)
-    before = dr.random_opd(1, npix=model.npix).data
+    before = dr.wavefront.random_opd(1, npix=model.npix).data
     fits.writeto(tmp_path / "opd.fits", before, fits.Header({"BUNIT": "m"}))
-    image = model(before + dr.random_opd(2, npix=model.npix, rms=2e-9).data).detach().numpy()
+    image = (
+        model(before + dr.wavefront.random_opd(2, npix=model.npix, rms=2e-9).data).detach().numpy()
+    )
     # The brightest pixel has 90 sigma.
     (x, y), light = np.array(CENTER, dtype=int), np.zeros((SIDE, SIDE))
     light[y - 20 : y + 21, x - 20 : x + 21] = 100 * image / image.max()
@@ -605,7 +607,7 @@ def test_files_with_and_without_a_planet(tmp_path):
     star = str(calints(tmp_path / "star_calints.fits", light=light))
     config = {
         "workers": 0,
-        "options": {"size": 24, "systematics": "off", "settings": settings},
+        "options": {"size": 24, "pattern": "off", "settings": settings},
         "injections": {"contrasts": [2e-4], "separations": [0.6], "angles": [330.0]},
         "sequence": [{"files": star, "opd": str(tmp_path / "opd.fits")}],
     }

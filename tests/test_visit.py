@@ -15,9 +15,9 @@ from pyklip_diffrender.detection import sources_of_references
 from pyklip_diffrender.detection.error_factor import structures_in_single_roll
 from pyklip_diffrender.pattern import (
     PatternLibrary,
-    choose_systematics,
+    choose_pattern,
     is_known_beside,
-    known_systematics,
+    known_pattern,
     measure_patterns,
     pattern_for_visit,
 )
@@ -26,7 +26,7 @@ from pyklip_diffrender.reduction import visit as visits
 from pyklip_diffrender.reduction.klip import klip_curve
 from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.reduction.visit import with_references
-from pyklip_diffrender.refinement import GaussNewton, align_frame, join_frames, refine
+from pyklip_diffrender.refinement import FitSettings, align_frame, join_frames, refine
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.settings import exposure_sequences
 from pyklip_diffrender.scene import Observation, Planet
@@ -36,12 +36,12 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior
 SIZE, NPIX = 32, 64
 FLUX, FLAT, DRIFT = 1e8, 0.02, 1e-9
 PLANET = Planet(3e-5, 0.7, 40.0)
-SETTINGS = GaussNewton(
+SETTINGS = FitSettings(
     free=("star_offset", "flux", "background"), cycles=8.0,
     prior=WavefrontPrior({"segment": 6.0, "texture": 3.0}, knee=1.0, fit_scales=False),
     companions_if_stalled=False, min_model_error=0.002, robust=3.0,
 )  # fmt: skip
-OPD = dr.random_opd(1, npix=NPIX)
+OPD = dr.wavefront.random_opd(1, npix=NPIX)
 
 
 @cache
@@ -51,8 +51,8 @@ def model():
 
 def image(change, place, drift=DRIFT):
     """A point source of flux 1 with a wavefront that differs from the map."""
-    now = OPD.data + dr.random_opd(90, npix=NPIX, rms=4e-9).data
-    now = now + dr.random_opd(100 + change, npix=NPIX, rms=drift).data
+    now = OPD.data + dr.wavefront.random_opd(90, npix=NPIX, rms=4e-9).data
+    now = now + dr.wavefront.random_opd(100 + change, npix=NPIX, rms=drift).data
     return model()(now, star_offset=place).detach().numpy()
 
 
@@ -93,9 +93,9 @@ def reference(k, brightness=2.0, drift=DRIFT, companion=0.0, **changes):
 @cache
 def alone():
     """The pattern of the rolls themselves, and the fit of the target with it."""
-    choice = choose_systematics(science(), (), model(), OPD, settings=SETTINGS)
+    choice = choose_pattern(science(), (), model(), OPD, settings=SETTINGS)
     assert choice.origin == "rolls"
-    fit = refine(model(), science(), OPD, systematics=choice.systematics, settings=SETTINGS)
+    fit = refine(model(), science(), OPD, pattern=choice.pattern, settings=SETTINGS)
     return choice, fit
 
 
@@ -107,9 +107,9 @@ def joined(*references, **keywords):
 
 def together(fit, references, settings):
     """All frames in one likelihood, with the unknown pattern of the rolls."""
-    pattern = alone()[0].systematics
-    aligned = [align_frame(fit, each, settings, systematics=pattern) for each in references]
-    return join_frames(fit, aligned, settings, systematics=pattern)
+    pattern = alone()[0].pattern
+    aligned = [align_frame(fit, each, settings, pattern=pattern) for each in references]
+    return join_frames(fit, aligned, settings, pattern=pattern)
 
 
 def limit(fit):
@@ -170,7 +170,7 @@ def test_a_reference_with_another_wavefront_does_not_take_part():
 
 @pytest.mark.slow
 def test_a_reference_that_contradicts_the_target_is_left_out_by_name(monkeypatch):
-    monkeypatch.setattr("pyklip_diffrender.reduction.visit._UNLIKE", np.inf)
+    monkeypatch.setattr("pyklip_diffrender.reduction.visit._UNLIKE_STAR_RATIO", np.inf)
     turned = reference(1)
     turned = replace(turned, data=turned.data[:, ::-1].copy(), name="mirrored")
     fit, visit, used = joined(reference(0), turned)
@@ -265,12 +265,12 @@ def test_a_pattern_is_not_learned_twice_from_a_reference():
         return pattern_for_visit(replace(choice, **changes), science(), [reference(0)])
 
     assert pattern(origin="library") is not None
-    assert pattern(origin="given") is choice.systematics
+    assert pattern(origin="given") is choice.pattern
     # One that was given and has the star of a reference frame is not of other stars.
-    learned = replace(choice.systematics, provenance={"stars": ["hd-2"]})
-    assert pattern(origin="given", systematics=learned).name == "the rolls themselves"
+    learned = replace(choice.pattern, provenance={"stars": ["hd-2"]})
+    assert pattern(origin="given", pattern=learned).name == "the rolls themselves"
     assert learned.name == "the rolls themselves"
-    assert pattern(origin="off", systematics=None) is None
+    assert pattern(origin="off", pattern=None) is None
     elsewhere = [reference(0, first_pixel=(700, 1600))]
     assert pattern_for_visit(replace(choice, origin="none"), science()[:1], elsewhere) is None
 
@@ -286,13 +286,13 @@ TEACHING, TOGETHER = "reference star HD 2", "reference stars and target together
         (1, 2, {}, [TEACHING, TOGETHER], 0),
         (3, 2, {}, [TEACHING, TOGETHER], 0),
         (0, 2, {"references": "off"}, [], 2),
-        (0, 2, {"systematics": "off"}, [], 2),
+        (0, 2, {"pattern": "off"}, [], 2),
         (1, 1, {"references": "pattern"}, [TEACHING], 0),
     ],
 )
 def test_a_plan_has_what_reference_frames_are_used_for(near, far, options, planned, alone):
     references = (*(reference(k) for k in range(near)), *(later(k) for k in range(far)))
-    sequence = dr.Sequence("HD 1", science(), references)
+    sequence = dr.ExposureSequence("HD 1", science(), references)
     steps = describe_steps(sequence, ReduceOptions(size=SIZE, **options)).splitlines()
     names = [each.partition(". ")[2] for each in steps]
     assert [name for name in names if name in (TEACHING, TOGETHER)] == planned
@@ -319,14 +319,12 @@ def taught():
     frames = (later(0), later(1), later(2, 300), later(3, flat="other.fits"))
     maps = []
 
-    def map_for(date):
+    def opd_at(date):
         maps.append(date.isot[:10])
         return OPD
 
     few = replace(SETTINGS, max_iterations=4)
-    choice = choose_systematics(
-        rolls, frames, model(), OPD, settings=few, map_for=map_for, library=False
-    )
+    choice = choose_pattern(rolls, frames, model(), OPD, settings=few, opd_at=opd_at, library=False)
     assert maps == ["2022-11-27", "2023-07-30"]
     return choice
 
@@ -339,16 +337,16 @@ def test_a_pattern_is_learned_from_stars_of_any_epoch_with_the_same_flat_field()
     assert star == "HD 2"
     assert "flat field other.fits (R_FLAT), the target with jwst_nircam_flat_0001" in reason
     names = ["HD 2 0, day 55", "HD 2 1, day 55", "HD 2 2, day 300"]
-    assert choice.systematics.provenance["frames"] == names
+    assert choice.pattern.provenance["frames"] == names
     # It is the flat field of the pixels: after a few steps, three frames show more than half of it.
     true = FLAT * np.random.default_rng(5).normal(size=(SIZE, SIZE))
-    assert np.corrcoef(choice.systematics.pattern.flat, true.flat)[0, 1] > 0.6
+    assert np.corrcoef(choice.pattern.value.flat, true.flat)[0, 1] > 0.6
     # A library's pattern is averaged with it if it is an error of the same flat field.
     first, measured = choice.science[0], measure_patterns(choice.references)
     for flat, stars in ((FLAT_FIELD, ["HD 2", "HD 9"]), ("other.fits", ["HD 2"])):
         others = [replace(p, star="HD 9", catalogue=CatalogueStar(), flat=flat) for p in measured]
         library = PatternLibrary(tuple(others))
-        both = known_systematics(first, choice.references, library=library)
+        both = known_pattern(first, choice.references, library=library)
         assert both.provenance["stars"] == stars
     # That of frames in the likelihood is not counted twice; that of other epochs is known beside.
     near, fitted = [reference(0)], [f.observation for fit in choice.references for f in fit.frames]
@@ -362,7 +360,7 @@ def test_a_pattern_is_learned_from_stars_of_any_epoch_with_the_same_flat_field()
 def reduced(frames, **options):
     """The run of a reduction beside frames of reference stars, and its result."""
     options = ReduceOptions(settings=SETTINGS, size=SIZE, **options)
-    sequence = dr.Sequence("HD 1", science(), tuple(frames))
+    sequence = dr.ExposureSequence("HD 1", science(), tuple(frames))
     run = pipeline._Run(pipeline.prepare(sequence, OPD, options, model=model()), False)
     return run, run.result()
 
@@ -378,7 +376,7 @@ def test_references_of_other_epochs_teach_the_pattern_and_not_the_wavefront():
     assert "of another epoch" in result.visit.contributions[1].reason
     assert [each.observation.name for each in result.fit.frames] == [e.name for e in science()]
     assert result.reference_frames == 3
-    assert "3 for the flat-field pattern, 1 not used by the fit: only 1 frame" in str(result)
+    assert "3 for the detector pattern, 1 not used by the fit: only 1 frame" in str(result)
     candidate_of(result.detection)
     # With a pattern of which only the size is known it is 1.4, although that is fitted.
     assert result.fit.chi2_per_pixel < 1.2 < alone()[1].chi2_per_pixel
@@ -395,7 +393,7 @@ def test_references_of_other_epochs_teach_the_pattern_and_not_the_wavefront():
     ("options", "count", "reason"),
     [
         ({"references": "off"}, 2, "the option references is 'off'"),
-        ({"systematics": "off"}, 2, "another one, and systematics is 'off'"),
+        ({"pattern": "off"}, 2, "another one, and pattern is 'off'"),
         ({}, 1, "another one, and there are too few frames for a pattern, two at least"),
     ],
 )
@@ -424,12 +422,12 @@ def test_frames_of_several_flat_fields_do_not_share_a_pattern():
 
     same, other = (calibrated(science(), "a", flat) for flat in "ab")
     chosen, without = (
-        choose_systematics(each, (), model(), OPD, settings=SETTINGS) for each in (same, other)
+        choose_pattern(each, (), model(), OPD, settings=SETTINGS) for each in (same, other)
     )
     assert (chosen.origin, without.origin) == ("rolls", "none")
     aligned = replace(SETTINGS, wavefront=False, free=("flux", "background"))
     for frames, shared in ((same, True), (other, False)):
-        fit = refine(model(), frames, OPD, systematics=chosen.systematics, settings=aligned)
+        fit = refine(model(), frames, OPD, pattern=chosen.pattern, settings=aligned)
         shares = [bool((part.common != 0).any()) for part in fit.linear.frames]
         assert shares == [shared, shared]
     # Frames of a reference star with the same pixels, but another flat field, do not take part.
@@ -470,7 +468,7 @@ def test_the_size_of_the_drift_is_that_of_the_frames(monkeypatch):
 
 @pytest.mark.slow
 def test_frames_that_never_agree_are_left_out(monkeypatch):
-    monkeypatch.setattr(visits, "_ROUNDS", 2)
+    monkeypatch.setattr(visits, "_MOST_JOINT_FITS", 2)
 
     def contradicting(joint, count):
         return {joint.frames[count].observation.name: "it contradicts the others"}

@@ -34,7 +34,7 @@ from pyklip_diffrender.pyklip_backend.fitted_star import FittedPointing
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.reduction.pictures import _stamps
 from pyklip_diffrender.reduction.pipeline import _Run, prepare
-from pyklip_diffrender.scene import Sequence
+from pyklip_diffrender.scene import ExposureSequence
 from pyklip_diffrender.scene.observation import Window
 from pyklip_diffrender.scene.simulation import field_of, images_of_stars, within_field
 from pyklip_diffrender.wavefront import random_drift
@@ -56,7 +56,7 @@ PLANETS = (
 
 def frames_of(planets, *rolls):
     """A whole frame for each roll of a star with planets east of north."""
-    opd, frames = dr.random_opd(1, npix=128), []
+    opd, frames = dr.wavefront.random_opd(1, npix=128), []
     for k, roll in enumerate(rolls):
         seen = tuple(replace(each, position_angle=each.position_angle - roll) for each in planets)
         frame = dr.simulate(model(WHOLE), dr.Scene(STAR, planets=seen), opd, seed=5 + k)
@@ -67,8 +67,8 @@ def frames_of(planets, *rolls):
 @pytest.fixture(scope="module")
 def searched():
     """The search of two rolls of a star with three planets, and the whole frames."""
-    opd, frames = dr.random_opd(1, npix=128), frames_of(PLANETS, *ROLLS)
-    settings, fitted = dr.GaussNewton(cycles=8), model(FITTED)
+    opd, frames = dr.wavefront.random_opd(1, npix=128), frames_of(PLANETS, *ROLLS)
+    settings, fitted = dr.FitSettings(cycles=8), model(FITTED)
     cut = [each.cutout(FITTED) for each in frames]
     fit = dr.refine(fitted, cut, opd, settings=settings)
     # As in `reduce`, once more without the light of the sources beyond the fitted pixels.
@@ -97,18 +97,23 @@ def gaussian(contrast, x, y):
 @pytest.fixture(scope="module")
 def crowded():
     """A point source, an extended one, and another one at the lower edge; the star is known."""
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     planets = (POINT, *gaussian(4e-4, 1.3, 0.2), *gaussian(1e-3, -0.4, -2.4))
     frame = dr.simulate(model(100), dr.Scene(STAR, planets=planets), opd, seed=5)
-    settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False)
+    settings = dr.FitSettings(wavefront=False, companions_if_stalled=False)
     fit = dr.refine(model(24), frame.cutout(24), opd, settings=settings)
     detection = dr.detect(fit, relinearise=False)
     return detection, frame, wide_field(detection, [frame])
 
 
 def run_of(wholes, size, **settings):
-    options, opd = ReduceOptions(settings=dr.GaussNewton(**settings)), dr.random_opd(1, npix=128)
-    return _Run(prepare(Sequence("HD 1", tuple(wholes)), opd, options, model=model(size)), False)
+    options, opd = (
+        ReduceOptions(settings=dr.FitSettings(**settings)),
+        dr.wavefront.random_opd(1, npix=128),
+    )
+    return _Run(
+        prepare(ExposureSequence("HD 1", tuple(wholes)), opd, options, model=model(size)), False
+    )
 
 
 @pytest.mark.parametrize(
@@ -118,7 +123,10 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit(
     whole, size, contrast, separation
 ):
     """The first one's lobes are 27 times the noise, and a fit of the star alone never ends."""
-    source, opd = dr.Planet(contrast, separation, position_angle=200.0), dr.random_opd(1, npix=128)
+    source, opd = (
+        dr.Planet(contrast, separation, position_angle=200.0),
+        dr.wavefront.random_opd(1, npix=128),
+    )
     run, alone = (
         run_of([dr.simulate(model(whole), dr.Scene(STAR, planets=planets), opd, seed=5)],
                size, wavefront=False, companions_if_stalled=False)
@@ -133,9 +141,13 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit(
 
 def test_a_frame_in_which_the_image_of_the_pupil_samples_repeats_is_rendered_with_more():
     """That of 64 samples does after 9.0 arcsec, and the frame has 9.7."""
-    whole, source, opd = 156, dr.Planet.from_offset(1e-2, -2.2, 2.1), dr.random_opd(1, npix=128)
+    whole, source, opd = (
+        156,
+        dr.Planet.from_offset(1e-2, -2.2, 2.1),
+        dr.wavefront.random_opd(1, npix=128),
+    )
     frame = dr.simulate(model(whole), dr.Scene(STAR, planets=(source,)), opd, seed=5)
-    settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False, max_iterations=3)
+    settings = dr.FitSettings(wavefront=False, companions_if_stalled=False, max_iterations=3)
     coarse, cut = model(32).with_fidelity(npix=64), frame.cutout(32)
     (fit,) = dr.refine(coarse, cut, opd, settings=settings).frames
     (known,), _ = sources_beyond([fit], [frame], [cut])
@@ -170,10 +182,10 @@ def real_frame(shape, filter="F444W", mask="MASKA335R", center=None):
 @pytest.mark.parametrize("accuracy", ["full", "quick"])
 def test_of_the_whole_detector_the_field_of_the_mask_is_used(accuracy, caplog):
     frame = real_frame((2048, 2048), center=[641.3, 1675.4])
-    sequence = Sequence("HD 1", (frame,), (replace(frame, reference=True),))
+    sequence = ExposureSequence("HD 1", (frame,), (replace(frame, reference=True),))
     options = ReduceOptions(accuracy=accuracy, wide=True, size=24)
     caplog.set_level("INFO")
-    prepared = prepare(sequence, dr.random_opd(1, npix=128), options)
+    prepared = prepare(sequence, dr.wavefront.random_opd(1, npix=128), options)
     # As for SUB320 (20.16 arcsec); for all of the detector it would be 2,048.
     assert prepared.model.npix == {"full": 256, "quick": 128}[accuracy]
     (whole,), (reference,) = prepared.whole.science, prepared.whole.references
@@ -198,7 +210,9 @@ def test_of_the_whole_detector_the_field_of_the_mask_is_used(accuracy, caplog):
 def test_a_first_look_behind_a_bar_has_samples_for_all_of_it(filter):
     """In F210M the image of 128 samples repeats after 8 arcsec, and the bar is longer."""
     frame = real_frame((80, 80), filter, "MASKASWB")
-    prepared = prepare(Sequence("HD 1", (frame,)), "flat", ReduceOptions(accuracy="quick", size=56))
+    prepared = prepare(
+        ExposureSequence("HD 1", (frame,)), "flat", ReduceOptions(accuracy="quick", size=56)
+    )
     assert prepared.model.npix == {"F210M": 256, "F444W": 128}[filter]
     star, source = images_of_stars(frame, 0.4, 0.6)
     assert source.sum() > 2 * star.sum()
@@ -229,7 +243,7 @@ from test_wide_field import STAR, real_frame
 
 star = dr.nircam_coronagraph("F444W", npix=256, nlambda=3, fov_pixels=320)
 planet = dr.Planet.from_offset(1e-4, -4.2, 5.1)
-opd = dr.random_opd(1, npix=256)
+opd = dr.wavefront.random_opd(1, npix=256)
 sky = dr.simulate(star, dr.Scene(STAR, planets=(planet,)), opd, seed=5)
 frame = real_frame((2048, 2048), center=[641.5, 1675.5])
 frame.data[0] *= 30
@@ -238,9 +252,9 @@ frame.data[0, 1516:1836, 482:802] = sky.data[0]
 frame.error[0, 1516:1836, 482:802] = sky.error[0]
 # Where the star of another mask would be.
 frame.data[0, 1660:1680, 1200:1220] = 1e6
-settings = dr.GaussNewton.nircam("F444W", cycles=(6.0,), max_iterations=4)
-result = dr.reduce(dr.Sequence("HD 1", (frame,)), opd, settings=settings, wide=True, size=40)
-row = result.wide.candidates[0]
+settings = dr.FitSettings.nircam("F444W", cycles=(6.0,), max_iterations=4)
+result = dr.reduce(dr.ExposureSequence("HD 1", (frame,)), opd, settings=settings, wide=True,
+size=40) row = result.wide.candidates[0]
 # ru_maxrss would include the process of the tests, from which this one was made.
 peak = next(l.split()[1] for l in open("/proc/self/status") if l.startswith("VmHWM"))
 print(row["contrast"], row["x"].value, row["y"].value, peak)
@@ -276,17 +290,19 @@ def test_a_faint_source_at_the_edges_of_the_fitted_pixels_is_fitted_with_the_sta
 @pytest.mark.parametrize(("whole", "fitted"), [(56, 24), (64, 32)])
 def test_frames_hardly_larger_than_the_fitted_pixels_have_no_sources_at_their_edges(whole, fitted):
     """All of the smaller one is near the star, where no light is that of the background."""
-    frame = dr.simulate(model(whole + 4), dr.Scene(STAR), dr.random_opd(1, npix=128), seed=5)
+    frame = dr.simulate(
+        model(whole + 4), dr.Scene(STAR), dr.wavefront.random_opd(1, npix=128), seed=5
+    )
     # The star is not in the middle, so that columns and rows that are searched are not fitted.
     frame = frame.within(Window(4, 4, (whole, whole)))
-    settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False)
-    opd = dr.random_opd(1, npix=128)
+    settings = dr.FitSettings(wavefront=False, companions_if_stalled=False)
+    opd = dr.wavefront.random_opd(1, npix=128)
     fit = dr.refine(model(fitted), frame.cutout(fitted), opd, settings=settings)
     assert sources_at_edges(fit, [frame]) == []
 
 
 def test_pixels_that_light_from_beyond_blurs_into_are_left_out():
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     frame = dr.simulate(model(WHOLE), dr.Scene(STAR), opd, seed=5)
     # A source just beyond the fitted pixels, which end at 1.5 arcsec.
     light, of_cutout = (
@@ -304,7 +320,9 @@ def test_pixels_that_light_from_beyond_blurs_into_are_left_out():
     assert without_blurred_edges(cut, cut).valid.all()
     larger = cut.within(Window(-4, -4, (FITTED + 8, FITTED + 8)))
     assert (without_blurred_edges(cut, larger).valid == larger.valid).all()
-    prepared = prepare(Sequence("HD 1", (whole,)), opd, ReduceOptions(), model=model(FITTED))
+    prepared = prepare(
+        ExposureSequence("HD 1", (whole,)), opd, ReduceOptions(), model=model(FITTED)
+    )
     assert (prepared.sequence.science[0].valid[0] == ~left_out).all()
 
 
@@ -456,7 +474,7 @@ def ring(model, opd, position_angle, points=40):
 @cache
 def rolls(brightness):
     """Two rolls of the star, and the light of its ring in them."""
-    actual = dr.random_opd(1, npix=128).data + random_drift(3, hours=40, npix=128).data
+    actual = dr.wavefront.random_opd(1, npix=128).data + random_drift(3, hours=40, npix=128).data
     frames, rings = [], []
     rng = np.random.default_rng(1)
     for k, roll in enumerate(ANGLES):
@@ -472,19 +490,19 @@ def rolls(brightness):
 
 
 def star_alone(frames):
-    settings = dr.GaussNewton(cycles=10, response_npix=64)
-    return dr.refine(model(), frames, dr.random_opd(1, npix=128), settings=settings)
+    settings = dr.FitSettings(cycles=10, response_npix=64)
+    return dr.refine(model(), frames, dr.wavefront.random_opd(1, npix=128), settings=settings)
 
 
 @cache
 def fitted(brightness=BRIGHTNESS):
     """The star alone, and with extended light."""
     fit = star_alone(rolls(brightness)[0])
-    return fit, dr.fit_disk(fit)
+    return fit, dr.detection.fit_disk(fit)
 
 
 def with_disk(frames):
-    return dr.fit_disk(star_alone(frames))
+    return dr.detection.fit_disk(star_alone(frames))
 
 
 def amount(image, true):
@@ -527,20 +545,20 @@ def test_a_star_without_a_disk_has_none():
 @cache
 def small_fit():
     """A star without a companion in 24 x 24 pixels."""
-    opd = dr.random_opd(1, npix=128)
+    opd = dr.wavefront.random_opd(1, npix=128)
     frame = dr.simulate(model(24), dr.Scene(star=HOST), opd, seed=1)
-    return dr.refine(model(24), frame, opd, settings=dr.GaussNewton(cycles=4))
+    return dr.refine(model(24), frame, opd, settings=dr.FitSettings(cycles=4))
 
 
 def test_products_and_refusals(tmp_path):
     fit = small_fit()
     with pytest.raises(IncompatibleSetupError, match="inner: got"):
-        dr.fit_disk(fit, inner=-0.3)
+        dr.detection.fit_disk(fit, inner=-0.3)
     reference = replace(fit.frames[0].observation, reference=True)
     star = replace(fit, frames=(replace(fit.frames[0], observation=reference),))
     with pytest.raises(IncompatibleSetupError, match="got a reference star"):
-        dr.fit_disk(star)
-    disk = dr.fit_disk(fit, inner=0.4)
+        dr.detection.fit_disk(star)
+    disk = dr.detection.fit_disk(fit, inner=0.4)
     assert disk.image.shape == disk.error.shape == disk.light[0].shape == (24, 24)
     np.testing.assert_allclose(disk.image, fit.frames[0].residual[0], atol=1e-9 * HOST.photons)
     np.testing.assert_allclose(disk.error, fit.frames[0].observation.error[0])
@@ -655,7 +673,7 @@ def test_limits_are_those_of_the_pixels_that_are_left():
     assert (half.contrast_curve["lowest"] > whole.contrast_curve["lowest"]).any()
     np.testing.assert_array_equal(half.error, whole.error)
     np.testing.assert_array_equal(half.has_limits, whole.has_limits & (grid[..., 0] >= 0))
-    table = dr.completeness(half, separations=[0.6], strengths=[3.0], angles=12)
+    table = dr.detection.completeness(half, separations=[0.6], strengths=[3.0], angles=12)
     assert 5 < table["planets"][0] < 8  # Two of twelve are on the edge.
     with pytest.raises(IncompatibleSetupError, match=r"without_limits: got the shape \(3,\)"):
         dr.detect(fit, without_limits=np.zeros(3, dtype=bool))

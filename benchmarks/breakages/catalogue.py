@@ -176,7 +176,7 @@ def _rules_of_a_fit() -> list[Breakage]:
         ),
         Breakage(
             "rule-accurate-steps", "slow steps are followed by accurate ones",
-            "is_last = may_repeat and gain < self.settings.tolerance and kappa < _FAR",
+            "is_last = may_repeat and gain < self.settings.tolerance and kappa < _FAR_KAPPA",
             "is_last = False", "gradient",
         ),
         Breakage(
@@ -195,7 +195,7 @@ def _rules_of_a_fit() -> list[Breakage]:
         ),
         Breakage(
             "rule-finer", "a rough fit that does not explain its data goes on",
-            "is_rough = settings.tolerance > _FINER and fit.status is Status.MODEL_MISMATCH",
+            "is_rough = settings.tolerance > _FINER_TOLERANCE and fit.status is Status.MODEL_MISMATCH",
             "is_rough = False", "detection",
         ),
         Breakage(
@@ -269,12 +269,12 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "star-epochs", "coordinates of one star are compared at one epoch",
-            "years = year - np.array(self.epochs or (_OLDEST, year))",
-            "years = 0 * np.array(self.epochs or (_OLDEST, year))", "admission",
+            "years = year - np.array(self.epochs or (_OLDEST_COORDINATES_YEAR, year))",
+            "years = 0 * np.array(self.epochs or (_OLDEST_COORDINATES_YEAR, year))", "admission",
         ),
         Breakage(
             "few-pixels", "frames without valid pixels about the star are left out",
-            "if share >= _VALID:", "if share >= 0:", "admission",
+            "if share >= _VALID_PIXELS_SHARE:", "if share >= 0:", "admission",
         ),
         Breakage(
             "asn-roles", "associations say which frames are the target's",
@@ -324,8 +324,8 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "outliers", "hot pixels are left out, planets are not",
-            "> _BETTER * _explained(model.weigh(sources)).max()",
-            "< _BETTER * _explained(model.weigh(sources)).max()",
+            "> _OUTLIER_CHI2_RATIO * _explained(model.weigh(sources)).max()",
+            "< _OUTLIER_CHI2_RATIO * _explained(model.weigh(sources)).max()",
             "outliers",
         ),
         Breakage(
@@ -334,13 +334,14 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "no-map", "without a map the star's flux is uncertain by 40 %",
-            "return _UNTIED if fit.initial.data.any() else _WITHOUT_MAP", "return _UNTIED",
+            "return _FLUX_ERROR if fit.initial.data.any() else _FLUX_ERROR_FLAT_START",
+            "return _FLUX_ERROR",
             "star_flux",
         ),
         Breakage(
             "pattern-place", "the pattern is matched on the detector's pixels",
             "x, y = np.subtract(self.first_pixel, observation.first_pixel)",
-            "x, y = np.subtract(observation.first_pixel, self.first_pixel)", "systematics",
+            "x, y = np.subtract(observation.first_pixel, self.first_pixel)", "detector_pattern",
         ),
         Breakage(
             "own-pattern", "the target's own frames are not in its pattern",
@@ -361,7 +362,7 @@ def _fits() -> list[Breakage]:
         Breakage(
             "pattern-size", "the size of a pattern is 1 where frames show it",
             "return 1 + float(products.numerator) / information",
-            "return float(products.numerator) / information", "systematics sequence",
+            "return float(products.numerator) / information", "detector_pattern sequence",
         ),
     ]  # fmt: skip
 
@@ -414,7 +415,8 @@ def _around() -> list[Breakage]:
         ),
         Breakage(
             "pointings", "only frames of one orientation are averaged",
-            "(apart <= _SAME_PLACE) & (turned <= _SAME_ANGLE)", "(apart <= _SAME_PLACE)",
+            "(apart <= _SAME_STAR_PIXELS) & (turned <= _SAME_ROLL_DEG)",
+            "(apart <= _SAME_STAR_PIXELS)",
             "backend backend_refine",
         ),
         Breakage(

@@ -20,7 +20,7 @@ from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.linear.response import NANOMETRE, WavefrontResponse, downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
+from pyklip_diffrender.refinement import FitSettings, Refinement, refine
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
 
 JACOBIAN, REFINEMENT = "Jacobian", "refinement"
@@ -146,7 +146,7 @@ def _fit(
         setting.model,
         observation or setting.observation,
         setting.measured.cpu().numpy(),
-        settings=GaussNewton(**options),
+        settings=FitSettings(**options),
         start=start,
     )
 

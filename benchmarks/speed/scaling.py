@@ -11,7 +11,7 @@ import torch
 from benchmarks.speed.case import Case
 from benchmarks.speed.setting import Setting
 from pyklip_diffrender.linear.response import WavefrontResponse
-from pyklip_diffrender.refinement import GaussNewton, refine
+from pyklip_diffrender.refinement import FitSettings, refine
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
 
@@ -87,5 +87,5 @@ def _frames(setting: Setting, count: int) -> Callable[[], Any]:
     )[0]
     frames = [simulate(model, setting.scene, small[0], seed=k) for k in range(count)]
     basis = default_basis(4.0 if setting.quick else 8.0)
-    settings = GaussNewton(basis=basis, max_iterations=6)
+    settings = FitSettings(basis=basis, max_iterations=6)
     return lambda: refine(model, frames, small[1].numpy(), settings=settings)

@@ -2,7 +2,7 @@
 
     python examples/paper/beyond.py --opd BEFORE AFTER --seeds 10
 
-A planet of 1e-6 at 0.6 arcsec, the wavefront map 40 h old unless stated otherwise. Cases that cost
+A planet of 1e-6 at 0.6 arcsec, the OPD map 40 h old unless stated otherwise. Cases that cost
 more than a single fit (nine wavelengths, KLIP on refined residuals), and Adam, take a fifth of
 the seeds. "null" is the standard deviation of S/N with the candidates removed: 1 if errors are
 right. Where the ring's shape is given, the star is refined once more on the frame less the ring, as
@@ -59,7 +59,7 @@ class Case:
     ----------
     name : str
     fit : dict
-        Fields of `GaussNewton`.
+        Fields of `FitSettings`.
     truth : dict
         Settings of the model that makes the frames, and not of the one that is fitted.
     both : dict

@@ -2,7 +2,7 @@
 
     python examples/paper/companions.py --opd BEFORE AFTER --seeds 20
 
-The number of planets is not given to the search. The wavefront map is 40 h old; on the embedded
+The number of planets is not given to the search. The OPD map is 40 h old; on the embedded
 generator each frame has its own wavefront and drift.
 """
 

@@ -2,7 +2,7 @@
 
     python examples/paper/contrast_boundary.py --opd BEFORE AFTER --seeds 10
 
-The wavefront map is 40 h old. For methods that return a subtracted image, the contrast is 5 times
+The OPD map is 40 h old. For methods that return a subtracted image, the contrast is 5 times
 the noise over the light of a planet of contrast 1, both as defined for the paper's annulus SNR. The
 noise is the scatter of the pixels of the planet's annulus (3 pixels wide) over the square root of
 the number of pixels in the aperture (radius 1.5 pixels), in a frame without planets. The light is

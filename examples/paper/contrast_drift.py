@@ -2,7 +2,7 @@
 
     python examples/paper/contrast_drift.py --opd BEFORE AFTER --seeds 10
 
-A planet at 0.6 arcsec, 8e-7 to 4e-6, the wavefront map 10 to 80 h old. Images are those of the
+A planet at 0.6 arcsec, 8e-7 to 4e-6, the OPD map 10 to 80 h old. Images are those of the
 first seed; Adam takes a fifth of the seeds.
 """
 

@@ -19,7 +19,7 @@ import numpy as np
 from astropy.table import Table
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -91,7 +91,7 @@ def one_frame(setup: Setting, case: Case, seed: int) -> Table:
     setup = setup.redrawn(seed)
     shot = _shot(setup, case, seed)
     wrong = {"prior": _prior(setup, case.prior)} if case.prior else {}
-    settings = GaussNewton(**case.fit, **wrong)
+    settings = FitSettings(**case.fit, **wrong)
     fit = dr.refine(setup.model, shot.observation, setup.measured, settings=settings)
     detection = dr.detect(fit, threshold=math.inf)
     radius = np.hypot(detection.grid[..., 0], detection.grid[..., 1])

@@ -2,7 +2,7 @@
 
     python examples/paper/klip_table.py --opd BEFORE AFTER --seeds 10
 
-The wavefront map is 40 h old. KLIP has nine dithered frames of alpha Pictoris taken 3 h after the
+The OPD map is 40 h old. KLIP has nine dithered frames of alpha Pictoris taken 3 h after the
 target, 10 mas off (9 modes, 5 annuli, 4 subsections), and, in a second column, a library of 50
 frames (30 modes). Throughput compares each subtraction with that of the same frame without the
 planet. Adam takes half the seeds.

@@ -3,7 +3,7 @@
     python examples/paper/location.py --opd BEFORE AFTER --seeds 10
 
 A planet of 2e-6, 0.4 to 2.2 arcsec from the star, at an angle that changes from seed to seed, the
-wavefront map 40 h old. The search is blind: the measured position is that of the nearest candidate.
+OPD map 40 h old. The search is blind: the measured position is that of the nearest candidate.
 Adam takes a fifth of the seeds.
 """
 

@@ -16,7 +16,7 @@ from scene import Frame, Image, Planet, Scene, Setting, Star, planet_photons, st
 import pyklip_diffrender as dr
 from pyklip_diffrender.demo import simulate_references
 from pyklip_diffrender.reduction.klip import klip_rdi
-from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.refinement import FitSettings, Refinement
 from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.opd import resample
@@ -131,7 +131,7 @@ def adam(setup: Setting, shot: Frame, steps: int = STEPS) -> Subtracted:
 def gauss_newton(setup: Setting, shot: Frame, **changes: Any) -> Subtracted:
     """This package's default, or with other settings."""
     began = time.perf_counter()
-    settings = GaussNewton(**changes)
+    settings = FitSettings(**changes)
     fit = dr.refine(setup.model, shot.observation, setup.measured, settings=settings)
     return Subtracted(fit.frames[0].residual[0], time.perf_counter() - began, fit)
 
@@ -162,7 +162,7 @@ def all_of(
     many : ndarray, optional
         A library, for KLIP once more.
     **fit
-        Fields of `GaussNewton`.
+        Fields of `FitSettings`.
     """
     subtracted = {"initial": initial(setup, shot), "KLIP": klip(shot, frames)}
     if archive is not None:

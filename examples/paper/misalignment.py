@@ -2,7 +2,7 @@
 
     python examples/paper/misalignment.py --opd BEFORE AFTER --seeds 10
 
-A planet of 5e-6 at 0.6 arcsec, the wavefront map 40 h old, the stop shifted in x or y by up to 2 %
+A planet of 5e-6 at 0.6 arcsec, the OPD map 40 h old, the stop shifted in x or y by up to 2 %
 of the pupil, or turned by up to 2 degrees. PSNR over the 11 x 11 pixels about the planet, against
 the planet's expected image: by the paper's recipe and by Gauss-Newton with the stop held where it
 is not, and by Gauss-Newton with the alignment fitted (the default), as well as with the true star.

@@ -4,7 +4,7 @@
 
 One frame a seed with a planet (1e-6 at 0.6 arcsec), fitted twice: with the instrument found from
 the frame itself, and with its true alignment given. The errors of what was found, the planet's S/N
-in both, and the scatter of S/N where there is no planet. The wavefront map is 40 h old; on the
+in both, and the scatter of S/N where there is no planet. The OPD map is 40 h old; on the
 embedded generator each frame has a wavefront and a drift of its own.
 """
 
@@ -19,7 +19,7 @@ import torch
 from astropy.table import Table
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.scene.objects import Star
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -56,7 +56,7 @@ def one_seed(setup: Setting, seed: int) -> Table:
     setup = setup.redrawn(seed)
     shot, photons = observed(setup, seed)
     truth = {"star_offset": OFFSET, "lyot_shift": LYOT, "lyot_rotation": ROTATION}
-    held = GaussNewton(free=("flux", "background"))
+    held = FitSettings(free=("flux", "background"))
     aligned = dr.refine(setup.model, shot, setup.measured, settings=held, start=truth)
     matched = dr.detect(aligned).measure([PLANET.offset])
     fit = dr.refine(setup.model, shot, setup.measured)

@@ -2,7 +2,7 @@
 
     python examples/paper/progress.py --opd BEFORE AFTER --seeds 10
 
-A planet of 1e-6 at 0.6 arcsec, the wavefront map 80 h old. After some steps of the paper's recipe
+A planet of 1e-6 at 0.6 arcsec, the OPD map 80 h old. After some steps of the paper's recipe
 and of Gauss-Newton: the annulus SNR, the star-model error, and how much of the wavefront's true
 change the estimate has: rms of what is left over the rms of the change, inside the Lyot stop's
 openings, piston aside. Adam takes a fifth of the seeds. Maps are those of the first seed.

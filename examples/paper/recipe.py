@@ -1,4 +1,4 @@
-"""The recipe of Feng et al. 2025, section IV: Adam on every pixel of the wavefront map."""
+"""The recipe of Feng et al. 2025, section IV: Adam on every pixel of the OPD map."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def adam_recipe(
     learning_rate: float = 1e-11,
     **values: float | tuple[float, ...],
 ) -> AdamFit:
-    """Minimise the mean absolute error of the star over the pixels of the wavefront map.
+    """Minimise the mean absolute error of the star over the pixels of the OPD map.
 
     Parameters
     ----------

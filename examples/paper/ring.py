@@ -3,7 +3,7 @@
     python examples/paper/ring.py --opd BEFORE AFTER --seeds 20
 
 No wavefront explains a ring, and the first fit bends to it; `measure_shape` refines the star anew
-without it. What mere subtraction of the first fit keeps stands beside it. The wavefront map is 40 h
+without it. What mere subtraction of the first fit keeps stands beside it. The OPD map is 40 h
 old; on the embedded generator each frame has a wavefront and a drift of its own.
 """
 

@@ -1,7 +1,7 @@
 """Functions shared by the studies: the paper's scene, command-line options, and tables.
 
-The scene is that of Feng et al. 2025: beta Pictoris for two hours at 4.5 um, 80 x 80 pixels, a
-wavefront map that is some hours old. With ``--opd before.fits after.fits`` (two measured maps, 86
+The scene is that of Feng et al. 2025: beta Pictoris for two hours at 4.5 um, 80 x 80 pixels, an
+OPD map that is some hours old. With ``--opd before.fits after.fits`` (two measured maps, 86
 hours apart) the drift is real; otherwise both maps are simulated.
 """
 
@@ -48,7 +48,7 @@ class Setting:
     ----------
     model : OpticalSystem
     measured : ndarray, (npix, npix)
-        The wavefront map at the start of a fit, m.
+        The OPD map at the start of a fit, m.
     before, after : str
         Paths of measured maps, or "" for the embedded generator.
     """

@@ -17,7 +17,7 @@ import numpy as np
 from astropy.table import Table
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -49,7 +49,7 @@ def one_seed(setup: Setting, counts: tuple[int, ...], linked: int, seed: int) ->
             "linked_error": math.nan,
         }
         if 1 < count <= linked:
-            settings = GaussNewton(drift=DRIFT)
+            settings = FitSettings(drift=DRIFT)
             joint = dr.refine(setup.model, shots[:count], setup.measured, settings=settings)
             together = dr.detect(joint).measure([PLANET.offset])
             row["linked"] = float(together["contrast"][0])

@@ -2,7 +2,7 @@
 
     python examples/paper/snr_grid.py --opd BEFORE AFTER --seeds 10
 
-One of the three quantities varies at a time, about a planet of 1e-6 at 0.6 arcsec and a wavefront
+One of the three quantities varies at a time, about a planet of 1e-6 at 0.6 arcsec and an OPD
 map that is 40 h old. Throughput compares with the same frame without the planet. Adam is run for a
 fifth of the seeds.
 """

@@ -112,7 +112,7 @@ def about_fluxes() -> list[str]:
     return [
         "## Are fluxes unbiased and their errors right?",
         "",
-        "One planet a frame, at a known place from 0.3 to 2.3 arcsec, the wavefront map 40 h old. "
+        "One planet a frame, at a known place from 0.3 to 2.3 arcsec, the OPD map 40 h old. "
         "A pull is (measured - true) / error. Planets at the closed-form 5-sigma limit of their "
         "place must come out at S/N 5 on average: injection and recovery against the closed form. "
         "The last column is the share of the planet's light that the subtracted frame still has.",
@@ -346,7 +346,7 @@ def main() -> None:
         "",
         "Written by `python examples/paper/summary.py` from the tables in `docs/results`. The "
         "scene is the paper's (beta Pictoris, 2 h, 4.5 um, 80 x 80 pixels); *measured maps* are "
-        "two in-flight wavefront maps 86 h apart, *embedded generator* is `random_opd` and "
+        "two in-flight OPD maps 86 h apart, *embedded generator* is `random_opd` and "
         "`random_drift`.",
         "",
         "![S/N without a planet, contrast limit, fluxes](images/inference.png)",

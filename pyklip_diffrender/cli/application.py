@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import platform
-from collections import abc
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -38,7 +37,7 @@ from pyklip_diffrender.cli.session import (
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, RefinementError
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.scene.sequence import Sequence
+    from pyklip_diffrender.scene.sequence import ExposureSequence
     from pyklip_diffrender.wavefront.opd import Rule
 
 # The commands that compute something.
@@ -58,7 +57,7 @@ Examples:
 @option("--separation", type=click.FloatRange(0, 2.3), default=0.6, show_default=True,
         metavar="ARCSEC", help="Separation of the planet from the star.")  # fmt: skip
 @option("--hours", type=click.FloatRange(min=0), default=40.0, show_default=True, metavar="H",
-        help="Age of the wavefront map.")  # fmt: skip
+        help="Age of the OPD map.")  # fmt: skip
 @option("--seed", type=int, default=1, show_default=True, metavar="N",
         help="Random seed of wavefront, drift and noise.")  # fmt: skip
 @outputs("diffrender-demo")
@@ -99,7 +98,7 @@ def demo(
     click.echo("\n".join(result.table.pformat(max_lines=-1, max_width=-1)))
     click.echo(
         f"\nA planet of contrast {contrast:g} at {separation:g} arcsec; the "
-        f"wavefront map is {hours:g} h old.\nSNR: the paper's, in the planet's annulus. "
+        f"OPD map is {hours:g} h old.\nSNR: the paper's, in the planet's annulus. "
         "Throughput: fraction of the planet's light that is kept;\nit says nothing where much of "
         "the star remains, as with the initial map. Star error: rms\nresidual of the star in that "
         "annulus, in units of the noise.\n"
@@ -187,9 +186,9 @@ def reduce_frames(
     """
     require_frames(frames, program)
 
-    def read() -> tuple[Sequence, ...]:
+    def read() -> tuple[ExposureSequence, ...]:
         from pyklip_diffrender.archive import fetch_calints
-        from pyklip_diffrender.scene.sequence import Sequence
+        from pyklip_diffrender.scene.sequence import ExposureSequence
 
         files: Any = frames[0] if len(frames) == 1 else frames
         if program is not None:
@@ -198,7 +197,7 @@ def reduce_frames(
             files = fetch_calints(
                 program, target, filter=filter, folder=cache, progress=run.progress
             )
-        return Sequence.by_filter_and_epoch(files, target=target, filter=filter, star=star)
+        return ExposureSequence.by_filter_and_epoch(files, target=target, filter=filter, star=star)
 
     from pyklip_diffrender.cli.reducing import run_reduction
 
@@ -228,14 +227,14 @@ def detect_in_file(
     FRAMES is a calints file.
     """
 
-    def read() -> tuple[Sequence, ...]:
-        from pyklip_diffrender.scene.sequence import Sequence
+    def read() -> tuple[ExposureSequence, ...]:
+        from pyklip_diffrender.scene.sequence import ExposureSequence
 
         if frames.is_dir():
             raise IncompatibleSetupError(
                 f"{frames} is a folder, expected a file; the command reduce takes folders"
             )
-        return (Sequence.from_files([frames], star=star),)
+        return (ExposureSequence.from_files([frames], star=star),)
 
     from pyklip_diffrender.cli.reducing import run_reduction
 
@@ -255,7 +254,7 @@ Examples:
         help="Coronagraph mask of NIRCam.")  # fmt: skip
 @option("--monochromatic", type=float, metavar="M", help="A single wavelength, m.")
 @option("--opd", default="flat", show_default=True, metavar="FILE|flat",
-        help="Wavefront map: a FITS file, or flat.")  # fmt: skip
+        help="OPD map: a FITS file, or flat.")  # fmt: skip
 @option("--size", type=click.IntRange(min=1), default=80, show_default=True, metavar="N",
         help="Side of the image, pixels.")  # fmt: skip
 @option("--offset", type=float, nargs=2, default=(0.0, 0.0), show_default=True,
@@ -362,7 +361,7 @@ Examples:
   pyklip-diffrender learn calints --opd maps -o patterns/cycle1.fits
   pyklip-diffrender learn calints --star HIP17695 --star G-7-34 --opd maps -o patterns.fits
   pyklip-diffrender learn --program 1184 --filter F444W --opd mast -o patterns.fits
-  pyklip-diffrender reduce frames --opd maps --systematics patterns -o products""",
+  pyklip-diffrender reduce frames --opd maps --pattern patterns -o products""",
 )
 @click.argument("frames", type=file_type(), nargs=-1)
 @option(
@@ -403,7 +402,7 @@ def learn(
     output: Path,
     overwrite: bool,
 ) -> None:
-    """Learn the flat-field pattern from the frames of many stars.
+    """Learn the detector pattern from the frames of many stars.
 
     FRAMES are calints files, folders of them, patterns ("frames/*_calints.fits") or association
     files (*_asn.json), of stars without bright companions or disks; with --program they come from
@@ -415,9 +414,9 @@ def learn(
     run.claim_file(output)
     products = named_files(output.parent, (output.name,), overwrite)
     from pyklip_diffrender.archive import fetch_calints
-    from pyklip_diffrender.cli.reducing import map_for
+    from pyklip_diffrender.cli.reducing import opd_of
     from pyklip_diffrender.io.files import without_fits_suffix
-    from pyklip_diffrender.pattern import learn_library
+    from pyklip_diffrender.pattern import learn_patterns
 
     files = list(frames)
     if program is not None:
@@ -427,9 +426,9 @@ def learn(
             folder=cache,
             progress=run.progress,
         )
-    library = learn_library(
+    library = learn_patterns(
         files,
-        lambda sequence: map_for(sequence, opd, opd_date),
+        lambda sequence: opd_of(sequence, opd, opd_date),
         stars=stars,
         filters=filters,
         size=size,
@@ -450,15 +449,15 @@ def learn(
 
 # ``pyklip-diffrender doctor``: whether the package can work here.
 
-_LIBRARIES = (
+_REPORTED_LIBRARIES = (
     "torch", "numpy", "scipy", "astropy", "poppy", "photutils", "pyklip", "matplotlib",
 )  # fmt: skip
 
-_EXPLAINED = 1.5
+_FAILED_CHI2 = 1.5
 """Chi-squared per pixel above which the self-test has failed; 0.8 is usual."""
 
 
-def check_libraries(names: Iterable[str] = _LIBRARIES) -> str:
+def check_libraries(names: Iterable[str] = _REPORTED_LIBRARIES) -> str:
     """Import libraries that the package needs; returns their versions."""
     texts = [f"pyklip-diffrender {__version__}", f"Python {platform.python_version()}"]
     for name in names:
@@ -471,7 +470,7 @@ def check_data() -> str:
     """Read the library that comes with the package; the self-test reads the instrument's tables."""
     from pyklip_diffrender.pattern.library import package_library
 
-    return f"{len(package_library().patterns)} patterns of the flat field"
+    return f"{len(package_library().patterns)} detector patterns"
 
 
 def check_stpsf() -> str:
@@ -507,7 +506,7 @@ def check_machine() -> str:
 def check_fit(**settings: Any) -> str:
     """Simulate a telescope whose segments have moved, and refine its wavefront.
 
-    `settings` are arguments of `GaussNewton`, besides the basis. Raises RefinementError if the fit
+    `settings` are arguments of `FitSettings`, besides the basis. Raises RefinementError if the fit
     is not as good as it should be.
     """
     import numpy as np
@@ -515,7 +514,7 @@ def check_fit(**settings: Any) -> str:
 
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
     from pyklip_diffrender.optics.grid import PupilGrid
-    from pyklip_diffrender.refinement import GaussNewton, refine
+    from pyklip_diffrender.refinement import FitSettings, refine
     from pyklip_diffrender.scene.objects import Scene
     from pyklip_diffrender.scene.simulation import simulate
     from pyklip_diffrender.wavefront.bases import SegmentMotions
@@ -527,17 +526,17 @@ def check_fit(**settings: Any) -> str:
     motions = 1e-8 * np.random.default_rng(2).normal(size=len(basis))
     truth = measured + basis.opd(torch.from_numpy(motions), PupilGrid.full(model.npix)).numpy()
     frame = simulate(model, Scene(), truth, seed=1)
-    fit = refine(model, frame, measured, settings=GaussNewton(basis=basis, **settings))
+    fit = refine(model, frame, measured, settings=FitSettings(basis=basis, **settings))
     lit = model.entrance.lit.numpy()
     before, after = (1e9 * float(np.std((opd - truth)[lit])) for opd in (measured, fit.wavefront))
     text = (
         f"self-test: the error of the wavefront fell from {before:.1f} to {after:.1f} nm, with "
         f"chi-squared {fit.chi2_per_pixel:.2f} per pixel"
     )
-    if fit.status.usable and after < 0.5 * before and fit.chi2_per_pixel < _EXPLAINED:
+    if fit.status.usable and after < 0.5 * before and fit.chi2_per_pixel < _FAILED_CHI2:
         return text
     raise RefinementError(
-        f"{text}, expected below {0.5 * before:.1f} nm and {_EXPLAINED}. Do not use results of "
+        f"{text}, expected below {0.5 * before:.1f} nm and {_FAILED_CHI2}. Do not use results of "
         "this installation; look at the versions above", fit,
     )  # fmt: skip
 
@@ -598,7 +597,7 @@ for _command in (
     application.add_command(_command)
 
 
-def main(arguments: abc.Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line, and return the exit status.
 
     It is 0, 1 for an error that a message explains, 2 for wrong options, and 130 if interrupted.

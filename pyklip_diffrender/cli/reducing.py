@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from json import dumps, loads
@@ -25,7 +24,7 @@ from pyklip_diffrender.options import Accuracy, ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternLibrary,
     combine_libraries,
-    known_systematics,
+    known_pattern,
     package_library,
 )
 from pyklip_diffrender.reduction import (
@@ -40,9 +39,9 @@ from pyklip_diffrender.reduction import (
     write_comparison,
 )
 from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
-from pyklip_diffrender.scene.sequence import SHORT, Sequence, by_reason
+from pyklip_diffrender.scene.sequence import SHORT, ExposureSequence, by_reason
 from pyklip_diffrender.surveys.driver import survey
-from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_map
+from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_opd
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
@@ -76,11 +75,11 @@ class _Start:
             raise click.UsageError(str(error)) from error
         return cls(opd, opd_date, star_sed, checked)
 
-    def prepared(self, sequence: Sequence) -> Preparation:
-        """Show the frames of a sequence and its wavefront map, and check that it can be reduced."""
+    def prepared(self, sequence: ExposureSequence) -> Preparation:
+        """Show the frames of a sequence and its OPD map, and check that it can be reduced."""
         _show(sequence)
-        map_ = map_for(sequence, self.opd, self.opd_date)
-        click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
+        map_ = opd_of(sequence, self.opd, self.opd_date)
+        click.echo(f"OPD map: {map_.name}{_age(map_, sequence)}")
         return prepare(sequence, map_, self._options_for(sequence.filter))
 
     def _options_for(self, name: str | None) -> ReduceOptions:
@@ -94,7 +93,7 @@ class _Start:
 
 def run_reduction(
     run: Run,
-    read: Callable[[], tuple[Sequence, ...]],
+    read: Callable[[], tuple[ExposureSequence, ...]],
     *,
     output: Path,
     overwrite: bool,
@@ -162,7 +161,7 @@ def run_reduction(
     require_in_place(*written, above)
 
 
-def _clear(earlier: abc.Iterable[ProductFolder], used: abc.Collection[Path]) -> None:
+def _clear(earlier: Iterable[ProductFolder], used: Collection[Path]) -> None:
     """Delete products of an earlier run from folders that this run has not used."""
     for each in earlier:
         if each.asked not in used:
@@ -202,18 +201,18 @@ def _compared(summaries: Mapping[Path, Any], place: Path, **search: Any) -> Any:
     return loads(read_text(data))
 
 
-def describe_steps(sequence: Sequence, options: ReduceOptions) -> str:
+def describe_steps(sequence: ExposureSequence, options: ReduceOptions) -> str:
     """The steps of a reduction of a cut sequence, one in each line."""
-    systematics = options.systematics
-    searched = systematics == "auto" or isinstance(systematics, PatternLibrary)
-    libraries = [systematics] if isinstance(systematics, PatternLibrary) else []
+    pattern = options.pattern
+    searched = pattern == "auto" or isinstance(pattern, PatternLibrary)
+    libraries = [pattern] if isinstance(pattern, PatternLibrary) else []
     library = combine_libraries([*libraries, package_library()])
-    known = searched and known_systematics(sequence.science[0], library=library) is not None
+    known = searched and known_pattern(sequence.science[0], library=library) is not None
     teaching, joining = (
         frames(sequence, options) for frames in (frames_for_pattern, frames_in_likelihood)
     )
     steps = []
-    if known or not (searched or systematics == "references"):
+    if known or not (searched or pattern == "references"):
         teaching = ()
     if known:
         unplaced = [each.name for each in sequence.science if each.first_pixel is None]
@@ -239,7 +238,7 @@ def describe_steps(sequence: Sequence, options: ReduceOptions) -> str:
 
 
 def _require_flux_and_spectra(
-    sequences: abc.Sequence[Sequence], options: ReduceOptions, spectra: tuple[str, ...]
+    sequences: Sequence[ExposureSequence], options: ReduceOptions, spectra: tuple[str, ...]
 ) -> None:
     """Raise an exception, before any fit, for what does not hold in several filters."""
     filters = list(dict.fromkeys(each.filter or "unknown" for each in sequences))
@@ -253,7 +252,7 @@ def _require_flux_and_spectra(
         planet_spectra(listed, filters)
 
 
-def _names(sequences: abc.Sequence[Sequence]) -> list[str]:
+def _names(sequences: Sequence[ExposureSequence]) -> list[str]:
     """Names of the folders of sequences: their dates or filters, or both if both differ."""
     days = [_day(each) for each in sequences]
     filters = [each.filter or "unknown" for each in sequences]
@@ -275,13 +274,13 @@ def _listed(output: Path) -> list[Path]:
     return []
 
 
-def _day(sequence: Sequence) -> str:
+def _day(sequence: ExposureSequence) -> str:
     """First date of a sequence."""
     dates = [each.date.isot[:10] for each in sequence.science if each.date is not None]
     return min(dates, default="no-date")
 
 
-def _show(sequence: Sequence) -> None:
+def _show(sequence: ExposureSequence) -> None:
     """List the frames that are used, and those that are not with the reason."""
     table = sequence.table
     used = table[table["use"] != "excluded"]
@@ -293,8 +292,8 @@ def _show(sequence: Sequence) -> None:
         click.echo(f"left out: {names}: {reason}")
 
 
-def map_for(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:
-    """The wavefront map that --opd and --opd-date ask for."""
+def opd_of(sequence: ExposureSequence, opd: str, rule: Rule | None) -> OPDMap:
+    """The OPD map that --opd and --opd-date ask for."""
     is_folder = Path(opd).is_dir() and opd != "flat"
     if opd != _MAST and not is_folder:
         if rule is not None:
@@ -303,15 +302,15 @@ def map_for(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:
     date, rule = sequence.date, rule or "nearest"
     if date is None:
         raise IncompatibleSetupError(
-            "the frames have no date (DATE-BEG) to choose a wavefront map by; give the file of one "
+            "the frames have no date (DATE-BEG) to choose an OPD map by; give the file of one "
             "with --opd"
         )
     if is_folder:
-        return choose_map(opd, date, rule)
+        return choose_opd(opd, date, rule)
     return load_wss_opd_by_date(date, rule)
 
 
-def _age(opd: OPDMap, sequence: Sequence) -> str:
+def _age(opd: OPDMap, sequence: ExposureSequence) -> str:
     """When a map was sensed, as an apposition."""
     if opd.date is None or sequence.date is None:
         return ""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Parameters of glibc's ``mallopt``, from its header ``malloc.h``."""
 
-_KEPT = 2**25
+_MMAP_THRESHOLD_BYTES = 2**25
 """Size of the largest arrays whose memory is kept, bytes: the most that glibc allows."""
 
 
@@ -43,7 +43,7 @@ def keep_freed_memory() -> None:
         return
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
-        mallopt(_MMAP_THRESHOLD, _KEPT)
+        mallopt(_MMAP_THRESHOLD, _MMAP_THRESHOLD_BYTES)
         mallopt(_TRIM_THRESHOLD, 2**31 - 1)
 
 
@@ -348,11 +348,11 @@ def file_type(**settings: Any) -> click.Path:
 
 
 class _Wavefront(click.types.StringParamType):
-    """Name of a wavefront map, or a word in place of it; says what there is if it is missing."""
+    """Name of an OPD map, or a word in place of it; says what there is if it is missing."""
 
     def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:
         return (
-            "Name the FITS file of a wavefront map or a folder of maps, say mast to fetch the map "
+            "Name the FITS file of an OPD map or a folder of maps, say mast to fetch the map "
             "of the date, or flat to start without one (contrasts are then uncertain by 40 %)."
         )
 
@@ -437,12 +437,12 @@ def require_frames(frames: Sequence[Path], program: int | None) -> None:
 
 wavefront = _all(
     option("--opd", required=True, type=_Wavefront(), metavar="FILE|FOLDER|flat|mast",
-           section="Wavefront map",
-           help="Wavefront map to start from: a FITS file; a folder of maps, of which one is "
+           section="OPD map",
+           help="OPD map to start from: a FITS file; a folder of maps, of which one is "
            "chosen by its date; mast for the maps of MAST, through stpsf; or flat, with which a "
            "fit takes longer and contrasts are uncertain by 40 % unless --star-flux is given."),
     option("--opd-date", type=click.Choice(["nearest", "before", "after", "interpolate"]),
-           section="Wavefront map",
+           section="OPD map",
            help="Which map of a folder or of MAST, with respect to the frames; default: nearest."),
 )  # fmt: skip
 
@@ -457,7 +457,7 @@ search = _all(
                 "FITS or VOTable with units; without any they are micron and Jy. "
                 'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
     option("--dry-run", is_flag=True, section="Output",
-           help="Make all checks, show frames, wavefront map and steps, and stop."),
+           help="Make all checks, show frames, OPD map and steps, and stop."),
     option("--derivatives", is_flag=True, section="Output",
            help="Keep the fit's derivatives in fit.fits, which then takes ten times the space: "
            "they are needed to search the fit again."),

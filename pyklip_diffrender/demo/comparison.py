@@ -1,4 +1,4 @@
-"""The demo: a simulated planet near a star, with a wavefront map that is 40 hours old.
+"""The demo: a simulated planet near a star, with an OPD map that is 40 hours old.
 
 The scene follows Feng et al. 2025, with a seeded wavefront in place of the measured one: 4.5 um,
 beta Pictoris for two hours, 80 x 80 pixels; KLIP has nine dithered images of alpha Pictoris, taken
@@ -100,7 +100,7 @@ def run_demo(
 ) -> DemoResult:
     """Simulate, refine, subtract, and run KLIP on the same frame of `size` pixels a side.
 
-    The planet's place is in arcsec and degrees. The wavefront map is `hours` old; `seed` determines
+    The planet's place is in arcsec and degrees. The OPD map is `hours` old; `seed` determines
     wavefront, drift and noise.
     """
     planet = Planet(contrast, separation, position_angle)
@@ -208,7 +208,7 @@ _TITLES = {
     "detected": "Star refined, the planet found in the model",
 }
 
-_LIMIT = 6.0
+_RESIDUAL_SCALE_SIGMAS = 6.0
 """Limit of the scale for residuals, standard deviations."""
 
 
@@ -231,7 +231,7 @@ def draw_demo(result: DemoResult) -> Any:
         )
         title = _TITLES[name].format(hours=result.table.meta["hours"])
         drawing.signed_image(
-            ax, result.images[name] / result.noise, grid, _LIMIT, places=planet,
+            ax, result.images[name] / result.noise, grid, _RESIDUAL_SCALE_SIGMAS, places=planet,
             bar="residual / noise", title=f"{title}\nSNR {facts['annulus SNR']:.1f}{kept}",
         )  # fmt: skip
     _draw_changes(axes[1, 1:3], result)
@@ -256,7 +256,7 @@ def _draw_changes(axes: Any, result: DemoResult) -> None:
     )
     for ax, change, title in zip(axes, changes, titles, strict=True):
         seen = np.where(stop, change - change[stop].mean(), np.nan)
-        drawing.wavefront_map(ax, seen, result.model.diameter, title=title, limit=limit)
+        drawing.opd_map(ax, seen, result.model.diameter, title=title, limit=limit)
 
 
 def _strongest(result: DemoResult) -> str:

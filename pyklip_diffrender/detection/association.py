@@ -73,19 +73,19 @@ _NEAREST_PARALLAX = 0.7685
 _FASTEST_PROPER_MOTION = 10.4
 """Proper motion of Barnard's star, the largest of all stars, arcsec per year (Gaia DR3)."""
 
-_FLAT = 1e4
+_PLACE_VARIANCE_ARCSEC2 = 1e4
 """Variance of the place m, arcsec^2: much larger than any field."""
 
-_FLUX_RANGE = math.log(1e3)
+_LOG_FLUX_RANGE = math.log(1e3)
 """Logarithm of the ratio of the largest flux of sources to the smallest; log F is uniform."""
 
-_NEGLIGIBLE = 1e-4
+_SAME_SOURCE_LIKELIHOOD_RATIO = 1e-4
 """Likelihood of two sightings as one source over two sources, below which they are two."""
 
 _MOST_ASSOCIATIONS = 2000
 """Associations that are kept while sightings are added, the most probable ones."""
 
-_CLEAR = 0.99
+_VERDICT_PROBABILITY = 0.99
 """Probability of a hypothesis from which it is stated as the verdict."""
 
 
@@ -203,11 +203,11 @@ class Hypotheses:
     @property
     def verdict(self) -> str:
         """The hypothesis with a probability of 99 % or more, in words."""
-        if self.bound >= _CLEAR:
+        if self.bound >= _VERDICT_PROBABILITY:
             return "moves with the star"
-        if self.background >= _CLEAR:
+        if self.background >= _VERDICT_PROBABILITY:
             return "stays on the sky: a source in the background"
-        if self.neither >= _CLEAR:
+        if self.neither >= _VERDICT_PROBABILITY:
             return "neither moves with the star nor stays on the sky"
         return "not decided"
 
@@ -290,7 +290,7 @@ class Association:
 
     def _may_be_one(self, i: int, j: int) -> bool:
         one, other = sorted((i, j), key=lambda k: self._sightings[k].epoch)
-        return bool(logsumexp(self._seen((one, other))) > math.log(_NEGLIGIBLE))
+        return bool(logsumexp(self._seen((one, other))) > math.log(_SAME_SOURCE_LIKELIHOOD_RATIO))
 
     def _of_group(self, members: list[int], linked: NDArray[np.bool_]) -> Iterator[Source]:
         """Sources made of the sightings `members`, to which no other sighting can belong."""
@@ -362,7 +362,7 @@ class Association:
             _, size = np.linalg.slogdet(2 * math.pi * full)
             # The density of the places if m has the density 1, not the wide Gaussian's.
             density = -(away @ np.linalg.solve(full, away) + size) / 2
-            density += math.log(2 * math.pi * _FLAT)
+            density += math.log(2 * math.pi * _PLACE_VARIANCE_ARCSEC2)
             logs[kind] = density + (len(own) - 1) * math.log(self._area) + flux
         return logs
 
@@ -384,7 +384,7 @@ class Association:
                     frequency = share * circular / max(separation, 1e-3)
                     kernel += (np.cos(frequency * apart) - 1) / frequency**2
                 kernel *= (_ORBITAL_SPEED * circular) ** 2 / len(_ORBITAL_FREQUENCIES)
-        return mean.ravel(), np.kron(kernel + _FLAT, np.eye(2))
+        return mean.ravel(), np.kron(kernel + _PLACE_VARIANCE_ARCSEC2, np.eye(2))
 
     def predicted(self, track: Track, kind: str, epoch: int) -> tuple[Image, Image]:
         """Place (2,) and its covariance (2, 2) of a source at an epoch, from its sightings."""
@@ -424,6 +424,6 @@ def _flux_evidence(own: Sequence[Sighting]) -> float:
         mean, error = weighted_mean(values, errors)
         product = -(((values - mean) / errors) ** 2).sum() / 2 - np.log(errors).sum()
         product += math.log(error) - (len(values) - 1) * math.log(2 * math.pi) / 2
-        alone = -np.log(np.maximum(values, errors) * _FLUX_RANGE).sum()
-        total += float(product - math.log(max(mean, error) * _FLUX_RANGE) - alone)
+        alone = -np.log(np.maximum(values, errors) * _LOG_FLUX_RANGE).sum()
+        total += float(product - math.log(max(mean, error) * _LOG_FLUX_RANGE) - alone)
     return total

@@ -28,8 +28,8 @@ from pyklip_diffrender.scene.observation import Observation
 
 _log = logging.getLogger(__name__)
 
-_ITERATIONS = 12
-_SETTLED = 0.02
+_MOST_STEPS = 12
+_STILL_SIGMAS = 0.02
 """A position whose step is shorter than this many standard deviations stays where it is, so that
 its images are used again; the fit ends when all steps are shorter."""
 
@@ -109,7 +109,7 @@ class Candidates:
 
 
 def refine_candidates(
-    groups: Sequence[Group], candidates: Candidates, reach: float, iterations: int = _ITERATIONS
+    groups: Sequence[Group], candidates: Candidates, reach: float, iterations: int = _MOST_STEPS
 ) -> Candidates:
     """Fit contrasts and positions of all candidates together, with the star marginalised.
 
@@ -150,7 +150,7 @@ def refine_candidates(
         detection_errors = of_contrasts.diagonal().clamp(min=0).sqrt() / scale[:count]
         step = covariance @ vector
         contrasts = contrasts + step[:count]
-        is_settled = (step.abs() < _SETTLED * covariance.diagonal().sqrt()).reshape(3, count)
+        is_settled = (step.abs() < _STILL_SIGMAS * covariance.diagonal().sqrt()).reshape(3, count)
         if bool(is_settled.all()):
             converged = True
             break
@@ -165,16 +165,16 @@ def refine_candidates(
 
 # Amplitude and information of a planet at every pixel, with the star marginalised.
 
-_BATCH = 320
+_TEMPLATES_AT_A_TIME = 320
 """Number of templates that are rendered at a time."""
 
-_STORE = 1e9
+_STORE_BYTES = 1e9
 """Largest number of bytes of templates that are stored; otherwise they are rendered again."""
 
-_REACH = 5
+_LAG_PIXELS = 5
 """Largest distance at which the autocorrelation of the S/N is computed, pixels."""
 
-_PLACES = 4
+_LAG_PLACES = 4
 """Number of rows, and of columns, of places at which it is computed."""
 
 
@@ -186,10 +186,10 @@ class Maps:
         self.grid = self.groups[0][1].grid
         ny, nx = self.shape = self.grid.shape[:2]
         frames = sum(len(templates.frames) for _, templates in self.groups)
-        self._stores = 4.0 * frames * (ny * nx) ** 2 <= min(_STORE, self._spare())
+        self._stores = 4.0 * frames * (ny * nx) ** 2 <= min(_STORE_BYTES, self._spare())
         self._stored: dict[tuple[int, int], dict[int, Tensor]] = {}
         total, light = np.zeros((3, ny * nx)), np.zeros((2, ny * nx))
-        steps = np.linspace(0, 1, _PLACES + 2)[1:-1]
+        steps = np.linspace(0, 1, _LAG_PLACES + 2)[1:-1]
         rows, columns = np.meshgrid((ny * steps).astype(int), (nx * steps).astype(int))
         self._places = rows.ravel(), columns.ravel()
         cleaned = self._cleaned(
@@ -225,15 +225,15 @@ class Maps:
         # The covariance of the numerators of planets p and p' is p . Sigma^-1 p', so that the S/N
         # of noise has the correlation p . Sigma^-1 p' / sqrt(I I') with the information I. It is
         # averaged over a few places p.
-        side = 2 * _REACH + 1
+        side = 2 * _LAG_PIXELS + 1
         total, count = np.zeros((2, side, side))
         # Behind the mask the information is 0, and by rounding may be below it.
-        information = np.pad(np.maximum(self.information, 0.0), _REACH)
+        information = np.pad(np.maximum(self.information, 0.0), _LAG_PIXELS)
         for row, column, products in zip(*self._places, self._between, strict=True):
             window = np.s_[row : row + side, column : column + side]
             size = np.sqrt(information[window] * self.information[row, column].clip(0.0))
             total += np.divide(
-                np.pad(products, _REACH)[window], size, out=np.zeros_like(size), where=size > 0
+                np.pad(products, _LAG_PIXELS)[window], size, out=np.zeros_like(size), where=size > 0
             )
             count += size > 0
         return np.divide(total, count, out=np.zeros_like(total), where=count > 0)
@@ -278,8 +278,8 @@ class Maps:
         pixels = ny * nx * len(self.groups)
         with ProgressBar(name, pixels, shown=self.progress) as progress_bar:
             for g, (_, templates) in enumerate(self.groups):
-                for start in range(0, ny * nx, _BATCH):
-                    index = np.arange(start, min(start + _BATCH, ny * nx))
+                for start in range(0, ny * nx, _TEMPLATES_AT_A_TIME):
+                    index = np.arange(start, min(start + _TEMPLATES_AT_A_TIME, ny * nx))
                     images = self._stored.get((g, start))
                     if images is None:
                         images = templates.at_pixels(*np.divmod(index, nx))
@@ -344,12 +344,12 @@ def _products(cleaned: Mapping[int, Tensor], planets: Mapping[int, Tensor]) -> I
 
 # Refinement of the star with bright sources in the model, or subtracted from the data.
 
-_NEAR = 0.25
+_SAME_SOURCE_LAMBDA_D = 0.25
 """lambda/D between a companion of a fit and a candidate that are the same source. Positions of
 sources above the threshold are known to a tenth of it."""
 
-_SIMILAR = 0.1
-_SIGMAS = 5.0
+_CONTRAST_RATIO = 0.1
+_CONTRAST_SIGMAS = 5.0
 """Largest difference of the contrasts of companion and candidate, relative and in the companion's
 standard deviations, with which the fit has found the source."""
 
@@ -377,7 +377,9 @@ def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
     first = fit.frames[0].observation
     places = torch.from_numpy(first.turned(offsets.numpy(), templates.origin.observation))
     companions = torch.from_numpy(fit.bright_companions[:, 1:])
-    return (torch.cdist(places, companions) < _NEAR * fit.model.resolution).any(dim=1)
+    return (torch.cdist(places, companions) < _SAME_SOURCE_LAMBDA_D * fit.model.resolution).any(
+        dim=1
+    )
 
 
 def unconfirmed_companions(
@@ -405,15 +407,17 @@ def _confirmed(
     contrasts = candidates.contrasts.numpy()
     near = np.hypot(*np.moveaxis(fit.companions[:, None, 1:] - places, -1, 0))
     difference = np.abs(fit.companions[:, None, 0] - contrasts)
-    allowed = np.hypot(_SIMILAR * contrasts, _SIGMAS * fit.companion_errors[:, None, 0])
-    same = (near < _NEAR * fit.model.resolution) & (difference < allowed)
+    allowed = np.hypot(
+        _CONTRAST_RATIO * contrasts, _CONTRAST_SIGMAS * fit.companion_errors[:, None, 0]
+    )
+    same = (near < _SAME_SOURCE_LAMBDA_D * fit.model.resolution) & (difference < allowed)
     return np.asarray(same.any(axis=1))
 
 
 def are_companions(fit: Refinement, candidates: Candidates) -> NDArray[np.bool_]:
     """Which candidates are at the place of a companion of the fit, (candidates,)."""
     away = candidates.offsets.numpy()[:, None] - fit.companions[None, :, 1:]
-    near = np.hypot(*np.moveaxis(away, -1, 0)) < _NEAR * fit.model.resolution
+    near = np.hypot(*np.moveaxis(away, -1, 0)) < _SAME_SOURCE_LAMBDA_D * fit.model.resolution
     return np.asarray(near.any(axis=1))
 
 
@@ -465,7 +469,7 @@ def without_light(
 # derivatives by flux, x and y, in all frames. The covariance of the offsets follows from
 # the covariance of the unknowns.
 
-_STEP = 2e-3
+_SHIFT_ARCSEC = 2e-3
 """arcsec between images whose difference is a derivative, in single precision."""
 
 
@@ -537,8 +541,8 @@ def _offset_products(
     change = torch.zeros(len(frame.rows), dtype=torch.float64, requires_grad=True)
     source = image(change)
     with torch.no_grad():
-        steps = _STEP * torch.eye(2, dtype=torch.float64)
-        slopes = [(image(change, s) - image(change, -s)) / (2 * _STEP) for s in steps]
+        steps = _SHIFT_ARCSEC * torch.eye(2, dtype=torch.float64)
+        slopes = [(image(change, s) - image(change, -s)) / (2 * _SHIFT_ARCSEC) for s in steps]
         columns = torch.stack([source.detach(), *slopes])
         weighted = columns * frame.weight.to(columns.device) ** 2
         matrix = torch.tensordot(weighted, columns, dims=[[1, 2], [1, 2]])
@@ -550,7 +554,7 @@ def _offset_products(
 
 # Calibration errors of contrasts, from the star's flux and from the image of the source.
 
-_CLEAR = 25.0
+_OWN_ERROR_SNR = 25.0
 """S/N above which the error of a source's own image matters."""
 
 
@@ -591,7 +595,7 @@ def calibration_errors(
             for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
                 if linear.unknowns[unknown].name == "flux":
                     on_rows[row, :count] = 1 / fitted.flux
-            for j in torch.nonzero((snr > _CLEAR) & ~contained).flatten().tolist():
+            for j in torch.nonzero((snr > _OWN_ERROR_SNR) & ~contained).flatten().tolist():
                 by_modes = _by_modes(templates, k, frame, offsets[j])
                 on_rows[frame.first_mode :, [j, count + j]] = by_modes[:, None]
             on_rows[:, contained.repeat(2)] = 0.0
@@ -656,23 +660,23 @@ def caveats(detection: Any) -> str:
 
 # Point sources beside reference stars that were fitted together with a target.
 
-_THRESHOLD = 6.0
+_REFERENCE_SOURCE_SNR = 6.0
 """S/N above which a peak is a source. Fainter ones leave less than a fifth of it in the target."""
 
-_WORTH_A_LOOK = 4.5
+_REFERENCE_PEAK_SNR = 4.5
 """Approximate S/N, in units of its scatter, above which a peak is looked at more closely."""
 
-_SAME_ROLL = 1.0
+_SAME_ROLL_DEG = 1.0
 """Degrees between frames whose sources are at the same pixels."""
 
-_INNER = 0.3
+_INNER_ARCSEC = 0.3
 """Smallest separation, arcsec. Nearer to the star, a source is taken up by the wavefront."""
 
-_SPACING = 2
+_GRID_PIXELS = 2
 """Pixels between the positions that are looked at: about lambda/D in the long-wave channel. Between
 four of them a source keeps 0.7 of its S/N."""
 
-_STEPS = 6
+_PLACE_STEPS = 6
 """Largest number of steps of its position."""
 
 
@@ -717,11 +721,13 @@ def _brightest_source(
     """Contrast, x, y and S/N of the most significant source in frames of one reference star."""
     away = np.hypot(templates.grid[..., 0], templates.grid[..., 1])
     rows, columns = (each.ravel() for each in np.indices(away.shape))
-    chosen = (away.ravel() > _INNER) & (rows % _SPACING == 0) & (columns % _SPACING == 0)
+    chosen = (
+        (away.ravel() > _INNER_ARCSEC) & (rows % _GRID_PIXELS == 0) & (columns % _GRID_PIXELS == 0)
+    )
     rows, columns = rows[chosen], columns[chosen]
     snr = _approximate_snr(fit, places, rows, columns)
     peak = int(snr.argmax())
-    if snr[peak] < _WORTH_A_LOOK:
+    if snr[peak] < _REFERENCE_PEAK_SNR:
         return None
     # The search steps over pixels, and a source may be between them.
     group, pixel = (fit.star_only, templates), pixel_width(templates.grid)
@@ -729,9 +735,9 @@ def _brightest_source(
     products = fit.star_only.weigh(templates.at_pixels(row, column))
     contrast = (products.numerator / products.information).numpy()
     start = Candidates.at(templates.grid[row, column], contrast)
-    source = refine_candidates([group], start, _SPACING * pixel, _STEPS)
+    source = refine_candidates([group], start, _GRID_PIXELS * pixel, _PLACE_STEPS)
     measured = float(source.snr(ErrorFactor.constant(1.0))[0])
-    if measured < _THRESHOLD:
+    if measured < _REFERENCE_SOURCE_SNR:
         return None
     x, y = source.offsets[0].tolist()
     return float(source.contrasts[0]), x, y, measured
@@ -760,13 +766,13 @@ def _approximate_snr(
     weight = torch.zeros_like(cleaned)
     for k in places:
         roll = fit.frames[k].observation.roll_from(fit.frames[first].observation)
-        if abs(roll) < _SAME_ROLL:
+        if abs(roll) < _SAME_ROLL_DEG:
             scale = fit.frames[k].flux / fit.frames[first].flux
             cleaned += scale * linear.frames[k].weight * linear.cleaned[k]
             weight += (scale * linear.frames[k].weight) ** 2
     snr = np.zeros(len(rows))
-    for start in range(0, len(rows), _BATCH):
-        part = slice(start, start + _BATCH)
+    for start in range(0, len(rows), _TEMPLATES_AT_A_TIME):
+        part = slice(start, start + _TEMPLATES_AT_A_TIME)
         images = templates.at_pixels(rows[part], columns[part])[first].flatten(1).double()
         information = images.square() @ weight.flatten()
         snr[part] = images @ cleaned.flatten() / information.clamp(min=1e-300).sqrt()

@@ -42,7 +42,7 @@ COMBINED = {
 FREE = "free"
 """The family of all spectra without negative fluxes, and the spectrum of its candidates."""
 
-_STEP = 0.1
+_LIMITS_STEP_ARCSEC = 0.1
 """Step of the separations of limits, arcsec."""
 
 
@@ -394,7 +394,7 @@ def limits_table(
         # filter f is that amplitude times s_f. Contrasts are stated for the filter with the most
         # weight.
         f = int(np.argmax(weights[k][:, known].mean(axis=1)))
-        for separation in np.arange(inner, edge, _STEP):
+        for separation in np.arange(inner, edge, _LIMITS_STEP_ARCSEC):
             ring = (np.abs(distance - separation) <= half_width) & np.isfinite(errors[k])
             if ring.any():
                 flux = level * float(np.median(errors[k][ring])) * spectra.flux[k, f]

@@ -52,16 +52,16 @@ from pyklip_diffrender.refinement.residual import local_maxima
 _MOST_MOTIONS = 300
 """Largest number of orbital motions for which the epochs are added."""
 
-_DIFFERENT = 20.0
+_TWO_SOURCES_CHI2 = 20.0
 """Chi-squared of two degrees of freedom (5e-5) of two places at one epoch that are two sources."""
 
 _WITH_STAR, _ON_SKY = "all epochs, with the star", "all epochs, on the sky"
 """Names of the searches in which all epochs are added."""
 
-_UNLISTED = 9.0
+_UNLISTED_SPECTRUM_CHI2 = 9.0
 """Chi-squared by which free fluxes have to be better than all listed spectra to be preferred."""
 
-_BELOW = 0.7
+_PEAK_PIXEL_SIGMAS = 0.7
 """Standard deviations by which the highest pixel of a peak may be lower than the peak."""
 
 
@@ -298,11 +298,11 @@ class SourceSearch:
                 [min(self._apart(own, other) for other in group.values()) for group in groups]
                 for own in each.sources
             ]).reshape(len(each.sources), len(groups))  # fmt: skip
-            rows, columns = linear_sum_assignment(np.minimum(cost, _DIFFERENT))
+            rows, columns = linear_sum_assignment(np.minimum(cost, _TWO_SOURCES_CHI2))
             taken = {
                 int(row): groups[column]
                 for row, column in zip(rows, columns, strict=True)
-                if cost[row, column] < _DIFFERENT
+                if cost[row, column] < _TWO_SOURCES_CHI2
             }
             for k, own in enumerate(each.sources):
                 if k not in taken:
@@ -319,7 +319,7 @@ class SourceSearch:
         """
         away = one.place - other.place
         chi2 = float(away @ np.linalg.solve(one.covariance + other.covariance, away))
-        return min(chi2, _DIFFERENT * float(np.hypot(*away)) / (self.resolution / 2))
+        return min(chi2, _TWO_SOURCES_CHI2 * float(np.hypot(*away)) / (self.resolution / 2))
 
     def _as_seen(self, number: int, maps: Sequence[SkyMap], own: Mapping[str, MapSource]) -> _Seen:
         """Sighting of a candidate of some of the maps of an epoch."""
@@ -400,7 +400,7 @@ class SourceSearch:
                     continue
                 level = self.levels[name, kind]
                 image = family.statistic(stack)
-                for pixel in local_maxima(image, used, level - _BELOW, size=3):
+                for pixel in local_maxima(image, used, level - _PEAK_PIXEL_SIGMAS, size=3):
                     place = self._highest(search, move, family, self.grid[pixel], maps)
                     sigmas = float(family.statistic(self.stack(search, place, move, maps)))
                     if sigmas >= level and np.hypot(*place) >= self.inner:
@@ -606,4 +606,4 @@ def _preference(sigmas: float, family: str) -> float:
 
     Free fluxes always fit better, and stand for a spectrum that is not listed.
     """
-    return sigmas**2 - (_UNLISTED if family == FREE else 0.0)
+    return sigmas**2 - (_UNLISTED_SPECTRUM_CHI2 if family == FREE else 0.0)

@@ -100,7 +100,7 @@ def _orvara(table: QTable) -> Table:
     )
 
 
-_FORMATS: dict[str, tuple[Callable[[QTable], Table], str]] = {
+_EXPORT_FORMATS: dict[str, tuple[Callable[[QTable], Table], str]] = {
     "orbitize": (_orbitize, "ascii.csv"),
     "backtracks": (_backtracks, "ascii.csv"),
     "octofitter": (_octofitter, "ascii.csv"),
@@ -112,9 +112,9 @@ def write_astrometry(
     table: QTable, path: str | os.PathLike[str], format: str, *, overwrite: bool = False
 ) -> Path:
     """Write the positions of candidates; see `Detection.write_astrometry`."""
-    if format not in _FORMATS:
+    if format not in _EXPORT_FORMATS:
         raise IncompatibleSetupError(
-            f"format: got {format!r}, expected one of {', '.join(_FORMATS)}"
+            f"format: got {format!r}, expected one of {', '.join(_EXPORT_FORMATS)}"
         )
     missing = [
         what
@@ -127,7 +127,7 @@ def write_astrometry(
             "have them in ROLL_REF, and in EXPMID or DATE-BEG"
         )
     require_new([path], overwrite)
-    convert, form = _FORMATS[format]
+    convert, form = _EXPORT_FORMATS[format]
     plain = convert(table)
     for name in plain.colnames:
         if plain[name].dtype.kind == "f":
@@ -380,8 +380,8 @@ def searched_fits(
     Raises `IncompatibleSetupError` if there is no fit with a linear model, or one of another
     `digest`.
     """
-    fits = (_fit_beside(path),)
-    return fits, _groups_of(fits, digests, path)
+    searched = (_fit_beside(path),)
+    return searched, _groups_of(searched, digests, path)
 
 
 def fit_name(detection: str) -> str:

@@ -64,19 +64,19 @@ from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinat
 
 Mask = NDArray[np.bool_]
 
-_HALF_LINE = 1.5
+_HALF_LINE_LAMBDA_D = 1.5
 """lambda/D, rounded to pixels: the beam leaves at most 2 % of a point source at that distance."""
 
-_DIRECTIONS = 12
+_LINE_DIRECTIONS = 12
 """Number of directions of lines, over half a turn."""
 
-_SHARE = 0.18
+_OPENING_SHARE = 0.18
 """Least share of the smoothed brightness that the opening keeps of extended light. It was 0.21
 or more at the brightest peaks, of S/N 8 to 95, of simulated rings and clouds, which noise breaks up
 into clumps, and at most 0.16 for planets of S/N 13 and more 0.4 arcsec from a bright ring."""
 
-_FAINTEST = 1.0
-_LEAST = 3.0
+_FLOOR_SIGMAS = 1.0
+_PEAK_SIGMAS = 3.0
 """Standard deviations of one source: extended light is brighter than the first everywhere and than
 the second somewhere. The opening of noise was up to 2.9."""
 
@@ -84,10 +84,10 @@ _BESIDE_POINT = 0.2
 """Share of the brightest point source that extended light must have somewhere: errors of the model
 left up to 0.1 of a source about simulated companions of 1e-5 to 1e-3."""
 
-_MARGIN = 0.5
+_REGION_MARGIN_LAMBDA_D = 0.5
 """lambda/D by which regions exceed what is as bright as that."""
 
-_LIMIT = 5.0
+_POINT_SNR = 5.0
 """S/N of a point source that is significant."""
 
 
@@ -110,12 +110,12 @@ class ConnectedLight:
         # For every direction, lines of 2 `half` + 1 pixels that contain the pixel: the largest of
         # their smallest values. The profile reaches two half lines to each side, so that it holds
         # all of them.
-        half = max(1, round(_HALF_LINE * self.resolution))
+        half = max(1, round(_HALF_LINE_LAMBDA_D * self.resolution))
         along = np.arange(-2 * half, 2 * half + 1)
         source = peak * np.exp(-4 * np.log(2) * (along / self.resolution) ** 2)
         rows, columns = np.indices(self.smoothed.shape)
         best = np.zeros(self.smoothed.shape)
-        for angle in np.pi / _DIRECTIONS * np.arange(_DIRECTIONS):
+        for angle in np.pi / _LINE_DIRECTIONS * np.arange(_LINE_DIRECTIONS):
             profiles = [
                 ndimage.map_coordinates(
                     self.smoothed,
@@ -133,29 +133,31 @@ class ConnectedLight:
     @property
     def is_extended(self) -> Mask:
         """Where light is extended, (ny, nx); nowhere if all of it may be the error of a point."""
-        is_extended = self.opened > _SHARE * self.smoothed
-        least = max(_LEAST, _BESIDE_POINT * np.where(is_extended, 0, self.smoothed).max())
+        is_extended = self.opened > _OPENING_SHARE * self.smoothed
+        least = max(_PEAK_SIGMAS, _BESIDE_POINT * np.where(is_extended, 0, self.smoothed).max())
         return np.asarray(is_extended & (self.opened[is_extended].max(initial=0) > least))
 
     @property
     def region(self) -> Mask:
         """Where extended light may be, (ny, nx); empty if none is bright enough."""
-        labels, _ = ndimage.label(self.opened > _FAINTEST, structure=np.ones((3, 3)))
-        return self._with_margin(np.isin(labels, np.setdiff1d(labels[self.opened > _LEAST], 0)))
+        labels, _ = ndimage.label(self.opened > _FLOOR_SIGMAS, structure=np.ones((3, 3)))
+        return self._with_margin(
+            np.isin(labels, np.setdiff1d(labels[self.opened > _PEAK_SIGMAS], 0))
+        )
 
     @property
     def bright(self) -> Mask:
         """Where light is significant, whatever it is, (ny, nx)."""
-        return self._with_margin(self.smoothed > _LIMIT)
+        return self._with_margin(self.smoothed > _POINT_SNR)
 
     def _with_margin(self, mask: Mask) -> Mask:
         away = ndimage.distance_transform_edt(~mask) if mask.any() else np.inf
-        return np.broadcast_to(away <= _MARGIN * self.resolution, mask.shape)
+        return np.broadcast_to(away <= _REGION_MARGIN_LAMBDA_D * self.resolution, mask.shape)
 
     @property
     def hides_points(self) -> Mask:
         """Where a point source of S/N 5 would count as extended light, (ny, nx)."""
-        return np.asarray(self._opening(_LIMIT) > _SHARE * (self.smoothed + _LIMIT))
+        return np.asarray(self._opening(_POINT_SNR) > _OPENING_SHARE * (self.smoothed + _POINT_SNR))
 
 
 # Extended light about a star: an image of it, and where it comes from.
@@ -193,7 +195,7 @@ class Disk:
 
     Examples
     --------
-    With frames and wavefront maps in folders, which the package does not contain:
+    With frames and OPD maps in folders, which the package does not contain:
 
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", disk=True)  # doctest: +SKIP
@@ -318,15 +320,15 @@ Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 _log = logging.getLogger(__name__)
 
-_SPACING = 2
+_SPACING_PIXELS = 2
 """Distance of neighbouring sources over the whole field, pixels: about lambda/D in NIRCam's
 long-wave filters. A simulated ring that was fitted by sources so far apart, without those at every
 pixel, left a chi-squared of 2.2 per pixel, and of 1.05 with them."""
 
-_THRESHOLD = 1.0
+_SOURCE_SIGMAS = 1.0
 """Standard deviations that a source has to exceed."""
 
-_SIGNIFICANT = 4.0
+_DISK_CHI2_PER_SOURCE = 4.0
 """Decrease of chi-squared per source below which it is noise: it was 1.9 for a simulated star
 without a disk, and 11 to 26 for stars with one."""
 
@@ -364,10 +366,10 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
 
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4))
-    >>> dr.fit_disk(fit).contrast
+    >>> fit = dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=4))
+    >>> dr.detection.fit_disk(fit).contrast
     0.0
     """
     inner = float(to_arcsec(inner, "inner"))
@@ -381,7 +383,7 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
     original = [frame.observation for frame in fit.frames]
     sources = _fit_sources(fit, _positions(fit.frames[0].grid, inner))
     gain, extended = sources.gain, None
-    if gain >= _SIGNIFICANT * len(sources):
+    if gain >= _DISK_CHI2_PER_SOURCE * len(sources):
         with ProgressBar("disk", shown=progress) as bar:
             extended = _extended(fit, sources, inner, original, bar)
     if extended is None:
@@ -504,13 +506,15 @@ def _fit_sources(
 def _positions(grid: Image, inner: float) -> Pixels:
     """Rows and columns of the pixels on which sources are."""
     # The last ones, too, because the light of a disk goes on beyond the frame.
-    axes = (np.unique(np.append(np.arange(0, n, _SPACING), n - 1)) for n in grid.shape[:2])
+    axes = (np.unique(np.append(np.arange(0, n, _SPACING_PIXELS), n - 1)) for n in grid.shape[:2])
     rows, columns = (each.ravel() for each in np.meshgrid(*axes, indexing="ij"))
     outside = separation_of(grid)[rows, columns] >= inner
     return rows[outside], columns[outside]
 
 
-def _brightest(matrix: Image, vector: Image, start: Image, threshold: float = _THRESHOLD) -> Image:
+def _brightest(
+    matrix: Image, vector: Image, start: Image, threshold: float = _SOURCE_SIGMAS
+) -> Image:
     """The non-negative light that minimises the sum at the top of this module, (k,)."""
     # In units of each source's standard deviation: x C x / 2 - (g - s) x, with the threshold s and
     # the slope C x - g + s.

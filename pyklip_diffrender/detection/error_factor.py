@@ -10,7 +10,7 @@ where q is the star's light over the noise, weighted with the image of the plane
 process. The fit also says how well f is known at each position: noise in units of the multiplied
 errors follows Student's t, and the threshold of a search has to be higher.
 
-In a single roll, compact structures of the flat-field pattern pass for planets. The S/N that they
+In a single roll, compact structures of the detector pattern pass for planets. The S/N that they
 have as planets, with errors that are not multiplied, is added to f in quadrature.
 """
 
@@ -42,16 +42,16 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.refinement.residual import local_maxima
 
-_WINGS = 1.5
+_SOURCE_RADIUS_ELEMENTS = 1.5
 """Resolution elements about a source whose S/N is not used: about the size of its image."""
 
-_BRIGHT = 50.0
+_PIVOT_STAR_SNR = 50.0
 """Star over noise at which the two terms of the starlight are compared."""
 
 _KNOTS = 8
 """Number of separations at which the Gaussian process g is represented, evenly in log r."""
 
-_LENGTH = 1.0
+_LENGTH_LOG_R = 1.0
 """Correlation length of g in log r: separations that differ by less than a factor of e share it."""
 
 _SPREAD = 0.5
@@ -66,19 +66,19 @@ CLIP = 4.0
 """Standard deviations at which S/N is clipped, so that sources that are not yet candidates do not
 raise the threshold of others."""
 
-_THINNING = 2
+_FITTED_PIXEL_STEP = 2
 """Distance between the rows, and the columns, of pixels to which the factor is fitted."""
 
-_MEDIAN = float(stats.chi2.median(1))
+_MEDIAN_SQUARE = float(stats.chi2.median(1))
 """Median of the square of Gaussian noise."""
 
-_STEPS = 30
+_FIT_STEPS = 30
 """Largest number of steps of the fit."""
 
-_SETTLED = 1e-4
+_SETTLED_CHANGE = 1e-4
 """The fit ends when no parameter changes by more than this."""
 
-_ANGLES = 72
+_POSITIONS_PER_CIRCLE = 72
 """Positions per circle; the factor at a separation is their median."""
 
 
@@ -99,7 +99,7 @@ def structures_in_single_roll(snr: ArrayLike) -> Image:
     return np.asarray(-np.expm1(-number))
 
 
-_COMPACT = 4.0
+_COMPACT_SIGMAS = 4.0
 """Standard deviations by which the sum over a compact structure exceeds sums elsewhere."""
 
 
@@ -115,8 +115,8 @@ def compact_structures(pattern: Image, width: float) -> Image:
     squares = np.add.outer(steps, steps)
     point = np.exp(-4 * math.log(2) * squares / width**2)
     sums = convolve(pattern, point, mode="constant")
-    scatter = math.sqrt(float(np.median(sums**2)) / _MEDIAN)
-    peaks = (sums == maximum_filter(sums, size=2 * reach + 1)) & (sums > _COMPACT * scatter)
+    scatter = math.sqrt(float(np.median(sums**2)) / _MEDIAN_SQUARE)
+    peaks = (sums == maximum_filter(sums, size=2 * reach + 1)) & (sums > _COMPACT_SIGMAS * scatter)
     near = binary_dilation(peaks, squares <= width**2)
     return np.where(near, pattern, 0.0)
 
@@ -175,7 +175,7 @@ class ErrorFactor:
         radius = np.asarray(separation, dtype=float)
         if image.size == 1:
             return np.full(radius.shape, image[0, 0])
-        angle = np.linspace(0, 2 * np.pi, _ANGLES, endpoint=False)
+        angle = np.linspace(0, 2 * np.pi, _POSITIONS_PER_CIRCLE, endpoint=False)
         circles = radius[..., None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         values = self._interpolated(image, circles)
         columns, rows = np.moveaxis(pixels_of(self.grid, circles), -1, 0)
@@ -216,19 +216,19 @@ class ScatterModel:
     These have independent Gaussian priors with mean 0 and standard deviation 1.
     """
 
-    starlight: NDArray[np.float64]  # (n,), star over noise, in units of `_BRIGHT`.
+    starlight: NDArray[np.float64]  # (n,), star over noise, in units of `_PIVOT_STAR_SNR`.
     rings: NDArray[np.float64]  # (n, knots), derivative of log f^2 by the parameters of g.
 
     @classmethod
     def of(cls, starlight: Image, distance: Image, inner: float) -> ScatterModel:
         """For pixels with a star over noise, at distances from the star, both (n,)."""
         logs = np.log(np.maximum(distance, inner) / inner)
-        knots = np.linspace(0, max(logs.max(), _LENGTH), _KNOTS)
+        knots = np.linspace(0, max(logs.max(), _LENGTH_LOG_R), _KNOTS)
         covariance = _SPREAD**2 * _kernel(knots, knots) + 1e-6 * np.eye(_KNOTS)
         # Parameters are the values at the knots, made independent; g follows from them as the
         # mean of a Gaussian process does.
         rings = np.linalg.solve(np.linalg.cholesky(covariance), _SPREAD**2 * _kernel(knots, logs))
-        return cls(np.maximum(starlight, 0) / _BRIGHT, rings.T)
+        return cls(np.maximum(starlight, 0) / _PIVOT_STAR_SNR, rings.T)
 
     def evaluate(self, parameters: NDArray[np.float64]) -> tuple[Image, Image]:
         """Return log f^2, (n,), and its derivatives, (n, parameters)."""
@@ -260,9 +260,9 @@ class ScatterModel:
         if start is None:
             # From here clipping does not hide a scatter that is large everywhere.
             start = np.zeros(len(prior))
-            start[0] = np.log(np.median(squares) / _MEDIAN) / _SPREAD
+            start[0] = np.log(np.median(squares) / _MEDIAN_SQUARE) / _SPREAD
         parameters = start
-        for _ in range(_STEPS):
+        for _ in range(_FIT_STEPS):
             logs, slopes = self.evaluate(parameters)
             excess = np.minimum(squares * np.exp(-logs), CLIP**2) - 1
             curvature = independent / 2 * slopes.T @ slopes + prior
@@ -270,13 +270,13 @@ class ScatterModel:
             step = np.linalg.solve(curvature, gradient)
             step *= min(1.0, 1.0 / float(np.abs(step).max()))
             parameters = parameters + step
-            if np.abs(step).max() < _SETTLED:
+            if np.abs(step).max() < _SETTLED_CHANGE:
                 break
         return parameters, np.asarray(np.linalg.inv(curvature), dtype=float)
 
 
 def _kernel(first: Image, second: Image) -> Image:
-    return np.exp(-0.5 * ((first[:, None] - second) / _LENGTH) ** 2)
+    return np.exp(-0.5 * ((first[:, None] - second) / _LENGTH_LOG_R) ** 2)
 
 
 class Scatter:
@@ -292,11 +292,11 @@ class Scatter:
         self, starlight: Image, grid: Image, inner: float, resolution: float, independent: float
     ) -> None:
         self.grid, self.resolution = grid, resolution
-        self._independent = independent * _THINNING**2
+        self._independent = independent * _FITTED_PIXEL_STEP**2
         distance = separation_of(grid)
         # Neighbouring pixels say nearly the same.
         thinned = np.zeros(distance.shape, dtype=bool)
-        thinned[::_THINNING, ::_THINNING] = True
+        thinned[::_FITTED_PIXEL_STEP, ::_FITTED_PIXEL_STEP] = True
         self._used = thinned & (distance >= inner) & np.isfinite(starlight)
         typical = np.median(starlight[self._used]) if self._used.any() else 0.0
         everywhere = np.nan_to_num(starlight, nan=float(typical))
@@ -333,7 +333,7 @@ class Scatter:
         self, snr: Image, sources: Tensor | Image, start: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Parameters and their covariance; None if hardly any pixels are left."""
-        away = far_from(self.grid, sources, _WINGS * self.resolution)
+        away = far_from(self.grid, sources, _SOURCE_RADIUS_ELEMENTS * self.resolution)
         clear = self._used & np.isfinite(snr) & away
         if clear.sum() * self._independent < 1:
             return None
@@ -351,10 +351,10 @@ class Scatter:
 
 # Which peaks of a map of S/N are more than noise.
 
-_POSITIONS = 2.0
+_MOST_POSITIONS_PER_SOURCE = 2.0
 """Largest number of independent positions that a source counts for."""
 
-_JUDGED = 20
+_MOST_JUDGED_PEAKS = 20
 """Largest number of peaks that are judged."""
 
 Peak = tuple[int, int]
@@ -427,11 +427,11 @@ class Significance:
         """Peaks above a threshold that may be significant, the highest first; see `next_peak`."""
         factor = self.factor(snr, sources)
         # A source raises the scatter by which it is measured: it counts for a position or two.
-        raised = np.sqrt(1 + _POSITIONS * CLIP**2 / factor.freedom)
+        raised = np.sqrt(1 + _MOST_POSITIONS_PER_SOURCE * CLIP**2 / factor.freedom)
         scaled = raised * snr / factor.factors
         allowed = allowed & reaching(self.grid, self.inner)
         allowed &= far_from(self.grid, sources, pixel_width(self.grid))
-        return local_maxima(scaled, allowed, threshold, size=3)[:_JUDGED]
+        return local_maxima(scaled, allowed, threshold, size=3)[:_MOST_JUDGED_PEAKS]
 
     @staticmethod
     def sigmas(snr: ArrayLike, freedom: ArrayLike) -> Image:
@@ -491,10 +491,10 @@ def _derivatives(reach: int) -> tuple[Image, Image]:
 
 # The contrast curve.
 
-_SIGMAS = 5.0
+_LIMIT_SNR = 5.0
 """S/N of a contrast curve."""
 
-_COLUMNS = {
+_CURVE_COLUMNS = {
     "separation": (".3f", "from the star"),
     "contrast": (".2e", "median of the ring"),
     "delta_mag": (".2f", "magnitude difference of the median"),
@@ -520,36 +520,36 @@ def contrast_table(
 
     `errors` are standard deviations of contrasts at the pixels of each ring, multiplied by the
     factor, and `photon` the same for a known star. With the star's flux density, Jy, there is a
-    column of the median's flux density. `_COLUMNS` describes the columns.
+    column of the median's flux density. `_CURVE_COLUMNS` describes the columns.
     """
     rows = []
     # Where errors were scaled to the scatter of the S/N, noise follows Student's t, with as many
     # degrees of freedom as positions told of the scatter. The small-sample limit is the one that it
     # exceeds as rarely as Gaussian noise exceeds 5 sigma. The limit for a known star is the photon
     # limit of a matched filter.
-    corrections = factor.threshold_at(_SIGMAS, separations) / _SIGMAS
+    corrections = factor.threshold_at(_LIMIT_SNR, separations) / _LIMIT_SNR
     for separation, error, photon_error, correction in zip(
         separations, errors, photon, corrections, strict=True
     ):
         if not len(error):
             continue
-        limit = _SIGMAS * np.asarray(error)
+        limit = _LIMIT_SNR * np.asarray(error)
         middle = float(np.median(limit))
-        bound = _SIGMAS * float(np.median(photon_error))
+        bound = _LIMIT_SNR * float(np.median(photon_error))
         magnitude = -2.5 * math.log10(middle)
         rows.append(
             (separation, middle, magnitude, limit.min(), limit.max(), bound, middle * correction)
         )
-    values = dict(zip(_COLUMNS, np.array(rows, dtype=float).reshape(-1, 7).T, strict=False))
+    values = dict(zip(_CURVE_COLUMNS, np.array(rows, dtype=float).reshape(-1, 7).T, strict=False))
     values["error_factor"] = factor.at(values["separation"])
     if star is not None:
         values["flux_density"] = star * values["contrast"]
     units = {"separation": u.arcsec, "delta_mag": u.mag, "flux_density": u.Jy}
     curve = {name: each * units.get(name, 1) for name, each in values.items()}
-    return curve_table(curve, {"sigmas": _SIGMAS, "resolution_arcsec": resolution})
+    return curve_table(curve, {"sigmas": _LIMIT_SNR, "resolution_arcsec": resolution})
 
 
 def curve_table(values: Mapping[str, Any], meta: Mapping[str, Any]) -> QTable:
     """Make the table of a contrast curve of its columns, whose units are their own."""
-    columns = ((name, each, None, *_COLUMNS[name]) for name, each in values.items())
+    columns = ((name, each, None, *_CURVE_COLUMNS[name]) for name, each in values.items())
     return add_columns(QTable(meta=meta), columns)

@@ -35,10 +35,10 @@ from pyklip_diffrender.io.units import east_and_north, to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-_ROUNDS = 5
+_STAR_REFINEMENTS = 5
 """Largest number of refinements of the star for a bright extended source."""
 
-_SETTLED = 0.2
+_SETTLED_AMPLITUDE_SIGMAS = 0.2
 """The refinements end when its amplitude changes by less than this many standard deviations."""
 
 
@@ -93,12 +93,12 @@ def measured_shape(
     factor = scatter
     # Light of a bright source biases the wavefront, and part of it is taken for the star. Without
     # the light that was found so far, the next amplitude is what is left.
-    for _ in range(_ROUNDS if bright and single_frame else 0):
+    for _ in range(_STAR_REFINEMENTS if bright and single_frame else 0):
         fit = without_light(fits[0], {0: total * light})
         amplitude, error = _amplitude(fit.star_only, shape)
         total += amplitude
         factor = 1.0 if fit.status.calibrated else scatter
-        if abs(amplitude) < _SETTLED * error:
+        if abs(amplitude) < _SETTLED_AMPLITUDE_SIGMAS * error:
             break
     return total, factor * error
 
@@ -317,10 +317,10 @@ def _table(columns: list[Column], first: tuple[str, ...]) -> QTable:
 
 # Errors and thresholds of a search, from the residuals of its fits.
 
-_RINGS = (0.2, 0.6, 1.2, 2.0)
+_CHI2_RINGS_ARCSEC = (0.2, 0.6, 1.2, 2.0)
 """Separations between which chi-squared is stated, arcsec."""
 
-_DEGENERATE = 1e-6
+_DEGENERATE_EIGENVALUE = 1e-6
 """Relative eigenvalue below which sources are degenerate with each other."""
 
 
@@ -398,7 +398,7 @@ def chi2_by_ring(groups: Sequence[Group], sources: Tensor, factor: ErrorFactor) 
             squares.append(residuals[k].numpy()[used] ** 2)
             distances.append(separation_of(fitted.grid)[used])
     square, distance = np.concatenate(squares), np.concatenate(distances)
-    edges = [*(each for each in _RINGS if each < distance.max()), float(distance.max())]
+    edges = [*(each for each in _CHI2_RINGS_ARCSEC if each < distance.max()), float(distance.max())]
     rows = []
     for low, high in itertools.pairwise(edges):
         ring = (distance >= low) & (distance <= high)
@@ -435,8 +435,8 @@ def _residuals(groups: Sequence[Group], offsets: Tensor) -> tuple[list[list[Tens
     matrix, vector = (torch.stack(parts).sum(dim=0) for parts in zip(*equations, strict=True))
     # Sources that coincide have equal images: the pseudo-inverse shares the light among them, and
     # the rank of the matrix is the number of unknowns that they are.
-    contrasts = torch.linalg.pinv(matrix, rtol=_DEGENERATE, hermitian=True) @ vector
-    independent = int(torch.linalg.matrix_rank(matrix, rtol=_DEGENERATE, hermitian=True))
+    contrasts = torch.linalg.pinv(matrix, rtol=_DEGENERATE_EIGENVALUE, hermitian=True) @ vector
+    independent = int(torch.linalg.matrix_rank(matrix, rtol=_DEGENERATE_EIGENVALUE, hermitian=True))
     residuals = []
     for (linear, _), part in zip(groups, images, strict=True):
         light = {k: torch.tensordot(contrasts, each, dims=1)[None] for k, each in part.items()}

@@ -27,33 +27,33 @@ from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 
-_STRENGTH = 1.6
+_PLANET_OVER_LIMIT = 1.6
 """Contrast of an injected planet over the limit with the small-sample correction, which is the
 threshold of the search. At a limit of 5 sigma, nearly all planets of 8 sigma should be detected."""
 
-_TOGETHER = 7
+_MOST_PLANETS_AT_A_TIME = 7
 """Largest number of planets in the frames at a time."""
 
-_APART = 0.3
+_PLANETS_APART_ARCSEC = 0.3
 """Smallest distance in separation of planets in the frames at a time, arcsec: of images that
 overlap, each is noise for the others."""
 
-_FRACTION = 0.618
+_GOLDEN_SECTION = 0.618
 """The golden section, whose multiples modulo 1 are spread evenly."""
 
-_SAME = 0.1
+_SAME_ARCSEC = 0.1
 """A candidate this near to an injected planet is the planet, arcsec."""
 
 CLEAR = 0.3
 """Distance of injected planets from candidates, arcsec."""
 
-_GOLDEN = 137.5
+_GOLDEN_ANGLE_DEG = 137.5
 """Degrees between neighbours in separation."""
 
-_NEXT = 47.0
+_NEXT_SET_ANGLE_DEG = 47.0
 """Degrees between planets at the same separation, one set and the next."""
 
-_STEP = 10.0
+_FREE_PLACE_STEP_DEG = 10.0
 """Degrees by which a planet is moved on until its place is free."""
 
 
@@ -96,23 +96,25 @@ def recover_planets(
     curve = detection.contrast_curve
     rows: list[tuple[float, ...]] = []
     inner, outer = (float(end) for end in curve["separation"].value[[0, -1]])
-    together = int(np.clip((outer - inner) / _APART, 1, _TOGETHER))
+    together = int(np.clip((outer - inner) / _PLANETS_APART_ARCSEC, 1, _MOST_PLANETS_AT_A_TIME))
     for trial, start in enumerate(range(0, count, together)):
         rings = min(together, count - start)
         # Other separations in every set, so that sets fill the gaps.
-        parts = (np.arange(rings) + (0.5 + _FRACTION * trial) % 1) / rings
+        parts = (np.arange(rings) + (0.5 + _GOLDEN_SECTION * trial) % 1) / rings
         separations = inner + (outer - inner) * parts
         limits = np.exp(
             np.interp(separations, curve["separation"].value, np.log(curve["small_sample"]))
         )
         places = np.array(
             [
-                _free_place(detection, separation, _GOLDEN * k + _NEXT * trial)
+                _free_place(
+                    detection, separation, _GOLDEN_ANGLE_DEG * k + _NEXT_SET_ANGLE_DEG * trial
+                )
                 for k, separation in enumerate(separations)
             ]
         )
         injected = [
-            Planet.from_offset(_STRENGTH * limit, *place)
+            Planet.from_offset(_PLANET_OVER_LIMIT * limit, *place)
             for limit, place in zip(limits, places, strict=True)
         ]
         again = search(with_planets(frames, injected))
@@ -122,7 +124,7 @@ def recover_planets(
             rows.append((planet.separation, angle, planet.contrast, *measured))
     separation, angles, true, *found, detected = np.array(rows, dtype=float).reshape(-1, 7).T
     return add_columns(
-        QTable(meta={"strength": _STRENGTH}),
+        QTable(meta={"strength": _PLANET_OVER_LIMIT}),
         [
             ("separation", separation, u.arcsec, ".3f", "from the star"),
             ("position_angle", angles, u.deg, ".1f", "as in the table of candidates"),
@@ -164,7 +166,7 @@ def measured_planet(
     sources, factor = detection.sources, detection.error_factor
     unit = detection.fits[0].frames[0].flux / flux
     distances = np.hypot(*(sources.offsets.numpy() - place).T)
-    if len(sources) and distances.min() < _SAME:
+    if len(sources) and distances.min() < _SAME_ARCSEC:
         k = int(distances.argmin())
         error = float(factor.of(sources.offsets)[k] * sources.errors[k, 0])
         contrast = float(sources.contrasts[k])
@@ -182,7 +184,7 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
     """
     table = detection.candidates
     candidates = np.stack([table["x"].value, table["y"].value], axis=-1)
-    turns = np.arange(0, 360, _STEP).tolist()
+    turns = np.arange(0, 360, _FREE_PLACE_STEP_DEG).tolist()
     circle: list[NDArray[np.float64]] = [
         np.array(Planet(1.0, separation, angle + turn).offset) for turn in turns
     ]
@@ -203,24 +205,24 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
 # the planet. The true-positive fraction is as in Jensen-Clem et al., AJ 155, 19 (2018), for the
 # false-positive fraction of the threshold.
 
-_STRENGTHS = tuple(np.geomspace(0.4, 3.0, 12).tolist())
+_PLANETS_OVER_LIMIT = tuple(np.geomspace(0.4, 3.0, 12).tolist())
 """Contrasts over the limit with the small-sample correction."""
 
 
-_NEAR = 0.5
+_SAME_LAMBDA_D = 0.5
 """Largest distance of a candidate from the planet that it stands for, lambda/D."""
 
-_BATCH = 64
+_PLANETS_AT_A_TIME = 64
 """Number of planets whose maps are computed at a time."""
 
-_FRACTIONS = (0.5, 0.95)
+_STATED_FRACTIONS = (0.5, 0.95)
 
 
 def completeness(
     detection: Detection,
     *,
     separations: ArrayLike | None = None,
-    strengths: Sequence[float] = _STRENGTHS,
+    strengths: Sequence[float] = _PLANETS_OVER_LIMIT,
     angles: int = 24,
     inner: float = 0.2,
     progress: bool = False,
@@ -263,10 +265,10 @@ def completeness(
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> frames = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6))
-    >>> table = dr.completeness(
+    >>> fit = dr.refine(model, frames, opd, settings=dr.FitSettings(cycles=6))
+    >>> table = dr.detection.completeness(
     ...     dr.detect(fit), separations=[0.6], strengths=[0.2, 3.0], angles=4
     ... )
     >>> table["completeness"].tolist()
@@ -285,7 +287,7 @@ def completeness(
     chosen = limit_at[1::2] if separations is None else curve_separations(grid, separations)
     free = detection.has_limits & far_from(grid, known.offsets, CLEAR)
     places = [
-        _free_places(grid, free, separation, angles, _GOLDEN * n)
+        _free_places(grid, free, separation, angles, _GOLDEN_ANGLE_DEG * n)
         for n, separation in enumerate(chosen)
     ]
     count = sum(map(len, places)) * len(strengths)
@@ -304,8 +306,8 @@ def completeness(
             search = searches[int(is_of_other)]
             light = limit * searches[0].star / search.star
             detected = np.zeros((len(strengths), len(offsets)), dtype=bool)
-            for start in range(0, len(offsets), _BATCH):
-                part = offsets[start : start + _BATCH]
+            for start in range(0, len(offsets), _PLANETS_AT_A_TIME):
+                part = offsets[start : start + _PLANETS_AT_A_TIME]
                 changes = search.maps.response(torch.from_numpy(part))
                 for n, (place, change) in enumerate(zip(part, changes, strict=True), start):
                     for s, strength in enumerate(strengths):
@@ -329,7 +331,7 @@ def completeness(
         "threshold": detection.threshold,
         "false_alarm": searches[0].significance.false_alarm(detection.threshold),
     }
-    for fraction in _FRACTIONS:
+    for fraction in _STATED_FRACTIONS:
         reached = contrast_of_completeness(table, fraction)
         table.meta["separation_arcsec"] = reached["separation"].value.tolist()
         table.meta[f"contrast_{100 * fraction:.0f}"] = np.asarray(reached["contrast"]).tolist()
@@ -412,5 +414,5 @@ class _Searched:
         snr = self.maps.snr(self.residual + change)
         everywhere = np.ones(snr.shape, dtype=bool)
         peaks = self.significance.significant_peaks(snr, self.sources, self.threshold, everywhere)
-        reach, grid = _NEAR * self.significance.resolution, self.significance.grid
+        reach, grid = _SAME_LAMBDA_D * self.significance.resolution, self.significance.grid
         return any(np.hypot(*(grid[peak] - place)) < reach for peak, _ in peaks)

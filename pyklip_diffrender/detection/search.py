@@ -89,16 +89,16 @@ def side_lobes(
 
 _log = logging.getLogger(__name__)
 
-_PEAKS = 3
+_MOST_TRIED_PEAKS = 3
 """Largest number of peaks that are tried, each with a fit of its own."""
 
-_APART = 2.0
+_SUBTRACTION_RESIDUAL_PIXELS = 2.0
 """Pixels between a candidate and a peak that is not what its subtraction left."""
 
-_LOWEST = 5.0
+_TRIED_PEAK_SNR = 5.0
 """S/N of a peak that is tried, without a factor."""
 
-_BETTER = 0.9
+_COMPANION_CHI2_RATIO = 0.9
 """Largest ratio of chi-squared with to without a companion. A planet that ends a fit at a
 wrong wavefront dominates chi-squared; errors of the model do not go away with one companion."""
 
@@ -121,9 +121,11 @@ def with_raised_peaks(
         return None
     snr = maps.snr(maps.without(candidates))
     allowed = reaching(maps.grid, inner)
-    allowed &= far_from(maps.grid, candidates.offsets, _APART * pixel_width(maps.grid))
-    best, least = None, _BETTER * _chi2(fits)
-    for peak in local_maxima(snr, allowed, _LOWEST, size=7)[:_PEAKS]:
+    allowed &= far_from(
+        maps.grid, candidates.offsets, _SUBTRACTION_RESIDUAL_PIXELS * pixel_width(maps.grid)
+    )
+    best, least = None, _COMPANION_CHI2_RATIO * _chi2(fits)
+    for peak in local_maxima(snr, allowed, _TRIED_PEAK_SNR, size=7)[:_MOST_TRIED_PEAKS]:
         contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
         tried = candidates.with_one_more(maps.grid[peak], contrast)
         refined = with_companions(fits, tried, progress)
@@ -152,11 +154,11 @@ _MAX_CANDIDATES = 10
 """Largest number of candidates. More of them about one star are parts of something extended, and
 all positions are fitted again with every one that is added."""
 
-_STEPS = 6
+_POSITION_STEPS = 6
 """Largest number of steps of the positions while candidates are added or dropped. Point sources
 settle in these; parts of something extended do not, and would take most of the time."""
 
-_HIDDEN = 0.8
+_HIDDEN_PEAK_THRESHOLD_RATIO = 0.8
 """Part of the threshold above which a peak in several rolls is tried as a candidate though its S/N
 is below: the side lobes of a source raise the scatter by which it is judged. In a single roll, the
 light of structures of the detector would pass."""
@@ -229,10 +231,10 @@ def detect(
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> scene = dr.Scene(planets=(dr.Planet(1e-5, 0.6, 120.0),))
     >>> frames = dr.simulate(model, scene, opd, seed=3)
-    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6))
+    >>> fit = dr.refine(model, frames, opd, settings=dr.FitSettings(cycles=6))
     >>> len(dr.detect(fit).candidates)
     1
     """
@@ -453,7 +455,7 @@ class _PeakSearch:
         peak = significance.next_peak(snr, candidates.offsets, self.threshold, allowed)
         is_significant = peak is not None
         if peak is None and count_rolls(self.fits) > 1:
-            lowest = _HIDDEN * self.threshold
+            lowest = _HIDDEN_PEAK_THRESHOLD_RATIO * self.threshold
             peak = next(iter(significance.peaks(snr, candidates.offsets, lowest, allowed)), None)
         if peak is None:
             return None
@@ -508,7 +510,7 @@ class _PeakSearch:
 
     def _fitted(self, candidates: Candidates) -> Candidates:
         """All candidates fitted together, with their positions, by a few steps."""
-        return refine_candidates(self.maps.groups, candidates, self._reach, _STEPS)
+        return refine_candidates(self.maps.groups, candidates, self._reach, _POSITION_STEPS)
 
     @property
     def _reach(self) -> float:

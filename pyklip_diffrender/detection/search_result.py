@@ -157,10 +157,10 @@ class Detection:
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> scene = dr.Scene(planets=(dr.Planet(1e-4, 0.5, 54.0),))
     >>> frame = dr.simulate(model, scene, opd, seed=1)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4))
+    >>> fit = dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=4))
     >>> detection = dr.detect(fit)
     >>> len(detection.candidates)
     1

@@ -30,7 +30,7 @@ from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.io.units import east_and_north
 from pyklip_diffrender.scene.admission import EPOCH
 
-_ORDER = 5
+_SPLINE_ORDER = 5
 """Order of the splines between pixels. S/N maps have no higher frequencies than images, whose
 pixels are just small enough for them."""
 
@@ -158,10 +158,10 @@ class SkyMap:
     @cached_property
     def _splines(self) -> tuple[Image, ...]:
         """Coefficients of the S/N, and of the Gaussian standard deviations if they differ."""
-        first = spline_filter(self.snr, order=_ORDER)
+        first = spline_filter(self.snr, order=_SPLINE_ORDER)
         if not np.isfinite(self.freedom).any():
             return (first,)
-        return first, spline_filter(_gaussian(self.snr, self.freedom), order=_ORDER)
+        return first, spline_filter(_gaussian(self.snr, self.freedom), order=_SPLINE_ORDER)
 
     def _freedom_at(self, place: Image) -> float:
         """Degrees of freedom in the pixel of a place, (2,)."""
@@ -190,7 +190,7 @@ class SkyMap:
         values = [
             np.where(
                 known,
-                map_coordinates(each, pixel, order=_ORDER, mode="mirror", prefilter=False),
+                map_coordinates(each, pixel, order=_SPLINE_ORDER, mode="mirror", prefilter=False),
                 0.0,
             )
             for each in self._splines
@@ -207,7 +207,7 @@ class SkyMap:
         #     f' = (f(-2 h) - 8 f(-h) + 8 f(h) - f(2 h)) / 12 h,
         #
         # and their mean squares are divided by the mean square of the noise.
-        spline = spline_filter(self.noise, order=_ORDER)
+        spline = spline_filter(self.noise, order=_SPLINE_ORDER)
         used = np.isfinite(self.error) & (np.abs(self.noise) < 4)
         rows, columns = np.nonzero(used)
         step = 0.25
@@ -217,7 +217,7 @@ class SkyMap:
                 map_coordinates(
                     spline,
                     [rows + k * step * down, columns + k * step * right],
-                    order=_ORDER,
+                    order=_SPLINE_ORDER,
                     mode="mirror",
                     prefilter=False,
                 )

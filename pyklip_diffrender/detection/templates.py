@@ -20,29 +20,29 @@ from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-_FINE = 3
+_PLACES_PER_PIXEL = 3
 """Positions of sources per pixel, along x and y, in frames where they are not at pixel centres. A
 source that stands a sixth of a pixel from its template loses 0.5 % of its S/N in a map; candidates
 are measured with templates of their own."""
 
-_WAVELENGTHS = 4
+_MOST_TEMPLATE_WAVELENGTHS = 4
 """Largest number of wavelengths of the templates of a map where they must be the model's own."""
 
-_WIDTH = 0.1
+_BAND_PER_WAVELENGTH = 0.1
 """Width of the part of a bandpass, as a fraction of its mean wavelength, that one wavelength stands
 for in the templates of a map. For the filters of NIRCam these differ by an rms of 1 to 3 % from
 templates of the whole bandpass, and their amplitudes by 2e-4. Candidates are measured with all."""
 
-_DIFFERENCE = 5e-4
+_SHIFT_ARCSEC = 5e-4
 """arcsec between images whose difference is a derivative; accurate to 1e-4."""
 
-_BEYOND = torch.tensor([1.2, 1.2], dtype=torch.float64)
+_BEYOND_MASK_ARCSEC = torch.tensor([1.2, 1.2], dtype=torch.float64)
 """x, y from the star, arcsec, where the transmission of every mask is above 0.9."""
 
-_KEPT = 200
+_MOST_KEPT_IMAGES = 200
 """Largest number of images with derivatives that are kept."""
 
-_ALIGNED = 1e-6
+_SAME_PLACE = 1e-6
 """arcsec, degrees: frames that differ by less have their sources at the same places."""
 
 
@@ -81,13 +81,13 @@ class Templates:
         return offsets @ torch.from_numpy(rotation_matrix(self.rolls[k])).T
 
     def _points(self, k: int, right: int = 0, up: int = 0) -> PointSources:
-        """Sources of frame k, `right` and `up` in `_FINE` parts of a pixel off the centres."""
+        """Sources of frame k, `right` and `up` steps of the fine grid from the pixels' centres."""
         key = (k, right, up)
         if key not in self._sources:
             frame = self.frames[k]
             bandpass = _few_wavelengths(frame.model)
             detector = frame.model.detector
-            x, y = (part / _FINE * scale for part, scale in
+            x, y = (part / _PLACES_PER_PIXEL * scale for part, scale in
                     zip((right, up), detector.pixelscale, strict=True))  # fmt: skip
             self._sources[key] = PointSources(
                 frame.model.at_wavelengths(bandpass),
@@ -101,7 +101,7 @@ class Templates:
     def _aligned(self, k: int) -> bool:
         """Whether planets at the first frame's pixel centres are at pixel centres in frame k."""
         moved = self._axis(self.frames[k]) - self._axis(self.origin)
-        return abs(self.rolls[k]) < _ALIGNED and float(moved.abs().max()) < _ALIGNED
+        return abs(self.rolls[k]) < _SAME_PLACE and float(moved.abs().max()) < _SAME_PLACE
 
     def _axis(self, frame: FrameFit) -> Tensor:
         """Place of the star on the pixels, up to a constant."""
@@ -141,9 +141,9 @@ class Templates:
         """
         detector = self.frames[k].model.detector
         # In thirds of a pixel, a place is 3 times the nearest pixel plus -1, 0 or 1.
-        fine = (_FINE * self._pixels(k, offsets)).round().to(torch.int64)
-        pixel = torch.div(fine + _FINE // 2, _FINE, rounding_mode="floor")
-        part = fine - _FINE * pixel
+        fine = (_PLACES_PER_PIXEL * self._pixels(k, offsets)).round().to(torch.int64)
+        pixel = torch.div(fine + _PLACES_PER_PIXEL // 2, _PLACES_PER_PIXEL, rounding_mode="floor")
+        part = fine - _PLACES_PER_PIXEL * pixel
         ny, nx = detector.shape
         row, column = pixel
         inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
@@ -176,14 +176,14 @@ class Templates:
         """Light of a planet and its derivatives by x and y, (3, ny, nx), per arcsec."""
         key = (k, *offset.tolist())
         if key not in self._rendered:
-            if len(self._rendered) >= _KEPT:
+            if len(self._rendered) >= _MOST_KEPT_IMAGES:
                 self._rendered.clear()
             # Central differences: a fast path renders single stars, but only without forward-mode
             # derivatives, which take three times as long as four more images.
             parts = [self._light(k, offset)]
-            for step in _DIFFERENCE * torch.eye(2, dtype=torch.float64):
+            for step in _SHIFT_ARCSEC * torch.eye(2, dtype=torch.float64):
                 change = self._light(k, offset + step) - self._light(k, offset - step)
-                parts.append(change / (2 * _DIFFERENCE))
+                parts.append(change / (2 * _SHIFT_ARCSEC))
             self._rendered[key] = torch.stack(parts)
         return self._rendered[key]
 
@@ -193,7 +193,7 @@ class Templates:
         It is on neither of the axes, along which bars extend.
         """
         frame = self.frames[k]
-        place = self._star(frame) + _BEYOND
+        place = self._star(frame) + _BEYOND_MASK_ARCSEC
         # The pixel n // 2 of an even number is half a pixel beyond the middle of the array.
         middle = torch.tensor(
             [
@@ -227,8 +227,8 @@ def _few_wavelengths(model: OpticalSystem) -> Bandpass:
     """As few wavelengths as the templates of a map need."""
     bandpass = model.bandpass
     if "bandpass" not in model.adjustable:
-        return bandpass.thinned(_WAVELENGTHS)[1]
-    return bandpass.condensed(max(2, math.ceil(bandpass.width / _WIDTH)))
+        return bandpass.thinned(_MOST_TEMPLATE_WAVELENGTHS)[1]
+    return bandpass.condensed(max(2, math.ceil(bandpass.width / _BAND_PER_WAVELENGTH)))
 
 
 def _as_tensor(opd: NDArray[np.float64]) -> Tensor:

@@ -40,32 +40,32 @@ EDGE = 16
 and light scattered by the edge of the occulters' substrate appears in the first rows of every
 frame."""
 
-_FAR = 4.0
+_FAR_SOURCE_ARCSEC = 4.0
 """Separation of the source whose image is taken for all sources far from the star, arcsec. The
 occulter takes less than a percent of its light."""
 
-_KERNEL = 15
+_MATCHED_FILTER_PIXELS = 15
 """Side of that image in the matched filter, pixels."""
 
 REACH = 81
 """Side of the image that is subtracted for a source: it has side lobes far from its middle."""
 
-_FINE = 4
+_PER_PIXEL = 4
 """Positions per pixel, along x and y, at which it is rendered for photometry."""
 
-_BOX = 32
+_BACKGROUND_BOX_PIXELS = 32
 """Side of the boxes in which the background is estimated, pixels."""
 
-_CORE = 2.0
+_STAR_ARCSEC = 2.0
 """arcsec; closer to the star its residual is no background."""
 
-_OUTLIER = 5.0
+_OUTLIER_SIGMAS = 5.0
 """Standard deviations by which a pixel is brighter than its neighbours allow if it is masked."""
 
 _NOT_CONVERGED = 8
 """Flag of photutils for a fit that has not converged."""
 
-_FITTED = 9
+_FIT_PIXELS = 9
 """Side of the square in which a source is fitted, pixels."""
 
 
@@ -129,11 +129,11 @@ class WholeFrame:
         image = np.asarray(combined.data[0] - self.stars)
         separation = separation_of(self.grid)
         # In a small frame, its outer part is used.
-        core = min(_CORE, 0.7 * float(separation[combined.valid[0]].max()))
+        core = min(_STAR_ARCSEC, 0.7 * float(separation[combined.valid[0]].max()))
         unused = ~combined.valid[0] | (separation < core)
         ground = Background2D(
             np.where(combined.valid[0], image, 0.0),
-            _BOX,
+            _BACKGROUND_BOX_PIXELS,
             mask=unused,
             exclude_percentile=90.0,
             sigma_clip=SigmaClip(sigma=3.0),
@@ -146,7 +146,7 @@ class WholeFrame:
         """Standard deviation of the noise, (ny, nx); inf where masked, and in outliers."""
         combined = self.observation.combined()
         sigma = np.where(combined.valid[0], combined.error[0], np.inf)
-        middle = _KERNEL // 2
+        middle = _MATCHED_FILTER_PIXELS // 2
         cross = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4
         window = (slice(middle - 1, middle + 2),) * 2
         # An outlier is brighter than its neighbours allow: a source in
@@ -155,16 +155,16 @@ class WholeFrame:
         # is the variance of a pixel over 4 share^2.
         share = (self.kernel[window] * cross).sum() / self.kernel[middle, middle]
         allowed = np.maximum(convolve(self.residual, cross), 0.0) / share
-        uncertain = _OUTLIER * combined.error[0] * math.sqrt(1 + 0.25 / share**2)
+        uncertain = _OUTLIER_SIGMAS * combined.error[0] * math.sqrt(1 + 0.25 / share**2)
         # Residuals of the star are sharper than sources, too.
-        outlier = (self.residual > allowed + uncertain) & (separation_of(self.grid) > _CORE)
+        outlier = (self.residual > allowed + uncertain) & (separation_of(self.grid) > _STAR_ARCSEC)
         return np.where(outlier, np.inf, sigma)
 
     def _source(self, size: int, x: float = 0.0, y: float = 0.0) -> Image:
         """Source of contrast 1 far from the star, x, y pixels right of and above the middle."""
         model, values = self.fit.on_pixels(size)
         scale = np.array(model.detector.pixelscale)
-        far = torch.tensor([_FAR, 0.0], dtype=torch.float64)
+        far = torch.tensor([_FAR_SOURCE_ARCSEC, 0.0], dtype=torch.float64)
         values["star_offset"] = far
         values["detector_shift"] = torch.from_numpy(np.array([x, y]) * scale) - far
         with torch.no_grad():
@@ -174,18 +174,20 @@ class WholeFrame:
     @cached_property
     def kernel(self) -> Image:
         """Image of a source of contrast 1 in the middle of a square of pixels."""
-        return self._source(_KERNEL)
+        return self._source(_MATCHED_FILTER_PIXELS)
 
     @cached_property
     def _fine(self) -> Image:
         """The kernel, larger and sampled more finely than the pixels."""
-        fine = np.empty((_FINE * REACH, _FINE * REACH))
-        middle = (_FINE - 1) / 2
-        for row in range(_FINE):
-            for column in range(_FINE):
+        fine = np.empty((_PER_PIXEL * REACH, _PER_PIXEL * REACH))
+        middle = (_PER_PIXEL - 1) / 2
+        for row in range(_PER_PIXEL):
+            for column in range(_PER_PIXEL):
                 # A pixel right of the source's middle sees what a source to its left shows.
-                moved = self._source(REACH, (middle - column) / _FINE, (middle - row) / _FINE)
-                fine[row::_FINE, column::_FINE] = moved
+                moved = self._source(
+                    REACH, (middle - column) / _PER_PIXEL, (middle - row) / _PER_PIXEL
+                )
+                fine[row::_PER_PIXEL, column::_PER_PIXEL] = moved
         return fine
 
     @cached_property
@@ -193,13 +195,13 @@ class WholeFrame:
         """The fine image as a model for photutils."""
         from photutils.psf import ImagePSF
 
-        return ImagePSF(self._fine, oversampling=_FINE)
+        return ImagePSF(self._fine, oversampling=_PER_PIXEL)
 
     @cached_property
     def correlation(self) -> Image:
         """Autocorrelation of the S/N of noise, by distance in pixels."""
         image = fftconvolve(self.kernel, self.kernel[::-1, ::-1])
-        middle, reach = _KERNEL - 1, _KERNEL // 2
+        middle, reach = _MATCHED_FILTER_PIXELS - 1, _MATCHED_FILTER_PIXELS // 2
         near = slice(middle - reach, middle + reach + 1)
         return np.asarray(image[near, near] / image[middle, middle])
 
@@ -260,13 +262,16 @@ class WholeFrame:
         ny, nx = self.observation.shape
         rows, columns = np.arange(ny)[window[0]], np.arange(nx)[window[1]]
         # Twice as wide as the window, so that its copies on all sides are not seen.
-        beyond = max(0, REACH - 2 * max(len(rows), len(columns)) - 1) // 2 * _FINE
+        beyond = max(0, REACH - 2 * max(len(rows), len(columns)) - 1) // 2 * _PER_PIXEL
         fine = self._fine[beyond:-beyond, beyond:-beyond] if beyond else self._fine
         side = len(fine)
         # Cycles per pixel, along rows and columns.
-        ky, kx = np.fft.fftfreq(side, 1 / _FINE)[:, None], np.fft.rfftfreq(side, 1 / _FINE)
+        ky, kx = (
+            np.fft.fftfreq(side, 1 / _PER_PIXEL)[:, None],
+            np.fft.rfftfreq(side, 1 / _PER_PIXEL),
+        )
         # The middle is between two samples.
-        middle = (side - 1) / 2 / _FINE
+        middle = (side - 1) / 2 / _PER_PIXEL
         transform = np.fft.rfft2(fine) * np.exp(2j * np.pi * middle * (kx + ky))
         origin = self.pixels_of(np.zeros(2))
         to_pixels = (self.pixels_of(np.eye(2)) - origin).T
@@ -281,7 +286,7 @@ class WholeFrame:
                 np.exp(-2j * np.pi * k * (place - round(place))) for k, place in ((kx, x), (ky, y))
             )
             moved = np.fft.irfft2(transform * smoothed * along_x * along_y, s=fine.shape)
-            samples = [_FINE * (p - round(q)) % side for p, q in ((rows, y), (columns, x))]
+            samples = [_PER_PIXEL * (p - round(q)) % side for p, q in ((rows, y), (columns, x))]
             return np.asarray(moved[np.ix_(*samples)])
 
         return image
@@ -329,7 +334,7 @@ class WholeFrame:
         with warnings.catch_warnings():
             # Of a fit that has not converged, which its flags say as well.
             warnings.simplefilter("ignore", AstropyUserWarning)
-            fitted = PSFPhotometry(self.fine_image, (_FITTED, _FITTED))(
+            fitted = PSFPhotometry(self.fine_image, (_FIT_PIXELS, _FIT_PIXELS))(
                 image, error=np.where(unused, 1.0, self.sigma), mask=unused, init_params=start
             )[0]
         if fitted["flags"] & _NOT_CONVERGED:
@@ -347,43 +352,43 @@ class WholeFrame:
 
 # Bright sources beyond the fitted pixels, whose light inside them would keep a fit from converging.
 
-_WRONG = 0.5
+_EDGE_MODEL_ERROR_SIGMAS = 0.5
 """Error of the model at the edges of the fitted pixels, in standard deviations of the noise, above
 which a pixel is left out. A source of 0.01 of the star's flux at 3.2 arcsec left four false
 candidates there, and one of 0.1 at 1.5 arcsec residuals of four standard deviations."""
 
-_SHARE, _OUTER_SHARE, _OUTER = 0.2, 0.03, 3.0
+_BRIGHTNESS_RATIO, _OUTER_BRIGHTNESS_RATIO, _OUTER_FROM_ARCSEC = 0.2, 0.03, 3.0
 """Brightness of pixels beyond the fitted ones, relative to the brightest of these, from which there
 may be such a source, near the star and from a separation on, arcsec. One of 1e-3 of the star's flux
 has about 0.2, and one of 7e-5 has 0.045; without one, frames of three stars have up to 0.024."""
 
-_BRIGHT = 50.0
+_BEYOND_SOURCE_SNR = 50.0
 """Smallest S/N of such a source. The search of whole frames finds the fainter ones."""
 
-_SEEN = 10.0
+_SEEN_LIGHT_SNR = 10.0
 """Smallest S/N of its light in all fitted pixels together: a source of 7e-5 at 3.4 arcsec
 was a candidate of S/N 9 there."""
 
-_SAME = 0.2
+_SAME_ARCSEC = 0.2
 """arcsec between the places of a source in two frames that were aligned roughly."""
 
-_MOST = 5
+_MOST_BEYOND_SOURCES = 5
 """Largest number of such sources in a frame."""
 
-_LEFT = 0.3
+_LEFT_LIGHT_RATIO = 0.3
 """Largest part of a point source's light, in absolute values, that its fit leaves."""
 
-_RIM = 8
+_RIM_PIXELS = 8
 """Pixels beyond the fitted ones from which even faint sources disturb the fit."""
 
-_DEVIATIONS = 6.0
+_RIM_SOURCE_SIGMAS = 6.0
 """Smallest S/N of a source there, in standard deviations of the S/N between the sources, at least
 1. Without sources, it is 2 in frames of G 7-34, and the highest of 5,600 S/N is 4.4 times that."""
 
-_SEEN_AT_EDGE = 5.0
+_EDGE_LIGHT_SNR = 5.0
 """Smallest S/N of its light in all fitted pixels of a frame."""
 
-_UNLIKE = 4.0
+_RIM_SOURCE_CHI2 = 4.0
 """Largest reduced chi-squared of a faint source there: side lobes of another one have 15 to 22, and
 stars 1.5 to 2."""
 
@@ -407,8 +412,8 @@ def has_bright_pixels_beyond(whole: Observation, cut: Observation) -> bool:
     x, y = np.indices(smooth.shape)[::-1] - whole.center[0][:, None, None]
     scale_x, scale_y = whole.pixelscale
     away = np.hypot(scale_x * x, scale_y * y)
-    share = np.where(away > _OUTER, _OUTER_SHARE, _SHARE)
-    share[away <= _CORE] = np.inf  # Here the star is the brightest itself.
+    share = np.where(away > _OUTER_FROM_ARCSEC, _OUTER_BRIGHTNESS_RATIO, _BRIGHTNESS_RATIO)
+    share[away <= _STAR_ARCSEC] = np.inf  # Here the star is the brightest itself.
     share[inside] = np.inf
     outside = smooth > share * smooth[inside].max()
     return bool(outside[EDGE:-EDGE, EDGE:-EDGE].any())
@@ -440,7 +445,7 @@ def without_blurred_edges(whole: Observation, cut: Observation) -> Observation:
     difference = blurred(image)[inside] - blurred(image[inside])
     wrong = np.zeros(cut.shape, dtype=bool)
     within = np.s_[max(-y, 0) : min(rows - y, ny), max(-x, 0) : min(columns - x, nx)]
-    wrong[within] = np.abs(difference) > _WRONG * combined.error[0][inside]
+    wrong[within] = np.abs(difference) > _EDGE_MODEL_ERROR_SIGMAS * combined.error[0][inside]
     return replace(cut, valid=cut.valid & ~wrong)
 
 
@@ -460,11 +465,11 @@ def sources_beyond(
         light = np.zeros(cut.shape)
         for source in _point_sources(frame, inside):
             own = frame.light(source[None, 1:], source[:1])[inside]
-            if np.linalg.norm(own / noise) < _SEEN:
+            if np.linalg.norm(own / noise) < _SEEN_LIGHT_SNR:
                 continue
             light += own
             planet = Planet.from_offset(*source.tolist()).rotated(-whole.roll_from(wholes[0]))
-            if all(math.dist(planet.offset, each.offset) > _SAME for each in planets):
+            if all(math.dist(planet.offset, each.offset) > _SAME_ARCSEC for each in planets):
                 planets.append(planet)
         lights.append(light)
     return planets, lights
@@ -478,15 +483,15 @@ def sources_at_edges(fit: Refinement, wholes: Sequence[Observation]) -> list[Pla
     first, sources = fit.frames[0].observation, list[Planet]()
     for fitted, whole in zip(fit.frames, wholes, strict=True):
         cut, whole = fitted.observation, whole.combined()
-        size = max(cut.shape) + 2 * (EDGE + _RIM)
+        size = max(cut.shape) + 2 * (EDGE + _RIM_PIXELS)
         part = whole.within(Window.about(whole.center[0], (size, size)))
         inside, noise = _pixels_inside(part, cut), cut.combined()
         frame = WholeFrame(fitted, part, cut.roll_from(first), fit.companions)
         for values in _point_sources(frame, inside, at_edges=True):
             own = frame.light(values[None, 1:], values[:1])[inside] / noise.error[0]
             planet = Planet.from_offset(*values.tolist())
-            is_new = all(math.dist(planet.offset, each.offset) > _SAME for each in sources)
-            if is_new and np.linalg.norm(own[noise.valid[0]]) > _SEEN_AT_EDGE:
+            is_new = all(math.dist(planet.offset, each.offset) > _SAME_ARCSEC for each in sources)
+            if is_new and np.linalg.norm(own[noise.valid[0]]) > _EDGE_LIGHT_SNR:
                 sources.append(planet)
     return sources
 
@@ -503,20 +508,20 @@ def _point_sources(
     sources: list[Image] = []
     if not allowed.any():
         return sources
-    image, least = frame.residual, _BRIGHT
-    while allowed.any() and len(sources) < _MOST:
+    image, least = frame.residual, _BEYOND_SOURCE_SNR
+    while allowed.any() and len(sources) < _MOST_BEYOND_SOURCES:
         numerator, information = frame.products(image)
         snr = np.zeros_like(numerator)
         np.divide(numerator, np.sqrt(information), snr, where=allowed & (information > 0))
         if at_edges and not sources:
-            least = _DEVIATIONS * max(float(mad_std(snr[allowed])), 1.0)
+            least = _RIM_SOURCE_SIGMAS * max(float(mad_std(snr[allowed])), 1.0)
         row, column = np.unravel_index(snr.argmax(), snr.shape)
         if snr[row, column] < least:
             break
         place = frame.offsets_of(np.array([column, row]))
-        window = frame.window_about(place, _FITTED)
+        window = frame.window_about(place, _FIT_PIXELS)
         # Its lobes are not looked at again.
-        lobes = _SAME if at_edges else _CORE
+        lobes = _SAME_ARCSEC if at_edges else _STAR_ARCSEC
         allowed &= separation_of(frame.grid - frame.grid[row, column]) > lobes
         contrast = float(numerator[row, column] / information[row, column])
         fitted = frame.photometry(image, place, contrast)
@@ -524,8 +529,8 @@ def _point_sources(
             continue
         values, _, chi2 = fitted
         left = image - frame.light(values[None, 1:], values[:1])
-        is_point = np.abs(left[window]).sum() < _LEFT * np.abs(image[window]).sum()
-        if is_point or (at_edges and chi2 < _UNLIKE):
+        is_point = np.abs(left[window]).sum() < _LEFT_LIGHT_RATIO * np.abs(image[window]).sum()
+        if is_point or (at_edges and chi2 < _RIM_SOURCE_CHI2):
             image = left
             sources.append(values)
     return sources

@@ -77,7 +77,7 @@ class WideField:
 
     Examples
     --------
-    With frames and wavefront maps in folders, which the package does not contain:
+    With frames and OPD maps in folders, which the package does not contain:
 
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", wide=True)  # doctest: +SKIP
@@ -204,27 +204,27 @@ class WideField:
 
 _log = logging.getLogger(__name__)
 
-_MOST = 50
+_MOST_SOURCES = 50
 """Largest number of sources."""
 
-_LOBES = 1.5
+_SUBTRACTION_LOBES_ARCSEC = 1.5
 """arcsec from a source within which a peak may be what its subtraction left."""
 
-_LEFT = 0.1
+_LEFT_SNR_RATIO = 0.1
 """Largest part of a source's S/N that it may leave."""
 
-_SADDLE = 0.5
+_BLENDED_SADDLE_RATIO = 0.5
 """Part of the fainter peak's S/N that the map has everywhere between two sources that are blended:
 of two point sources, those less than about two lambda/D apart."""
 
-_POINT = 2.0
+_POINT_SOURCE_CHI2 = 2.0
 """Reduced chi-squared, over the squared error factor, up to which a source is fitted
 as a point source only."""
 
-_GAIN = 25.0
+_SHAPE_CHI2_GAIN = 25.0
 """Decrease of chi-squared, over the squared error factor, by the shape of an extended source."""
 
-_WIDTH = 0.5
+_SMALLEST_FWHM_LAMBDA_D = 0.5
 """Smallest full width at half maximum of an extended source, lambda/D. Errors of the image of a
 point source make bright ones slightly narrower or wider."""
 
@@ -232,16 +232,16 @@ _COVERED_SIGMAS = 3.0
 """Standard deviations of an extended source, with the width of a point source, within which peaks
 are parts of it."""
 
-_FWHM = math.sqrt(8 * math.log(2))
+_FWHM_SIGMAS = math.sqrt(8 * math.log(2))
 """Full width at half maximum of a Gaussian, in standard deviations."""
 
-_BESIDE = 4
+_FITTED_ABOUT_SOURCE_PIXELS = 4
 """Pixels about a source that are fitted with it."""
 
-_STEP = 0.1
+_CURVE_STEP_ARCSEC = 0.1
 """Distance between the separations of the contrast curve, arcsec."""
 
-_COVERED = 0.5
+_COVERED_RING_SHARE = 0.5
 """Part of a ring that must be in the frame for a limit to be stated."""
 
 
@@ -267,12 +267,12 @@ class _Shape:
     @property
     def major(self) -> float:
         """Full width at half maximum along the long axis, arcsec."""
-        return float(_FWHM * np.sqrt(np.linalg.eigvalsh(self.covariance)[1]))
+        return float(_FWHM_SIGMAS * np.sqrt(np.linalg.eigvalsh(self.covariance)[1]))
 
     @property
     def minor(self) -> float:
         """Full width at half maximum along the short axis, arcsec."""
-        return float(_FWHM * np.sqrt(max(np.linalg.eigvalsh(self.covariance)[0], 0.0)))
+        return float(_FWHM_SIGMAS * np.sqrt(max(np.linalg.eigvalsh(self.covariance)[0], 0.0)))
 
     @property
     def angle(self) -> float:
@@ -293,7 +293,7 @@ class _Source:
         """Whether places (k, 2) are within three standard deviations of an extended source."""
         if self.shape is None:
             return np.zeros(len(places), dtype=bool)
-        seen = self.shape.covariance + (resolution / _FWHM) ** 2 * np.eye(2)
+        seen = self.shape.covariance + (resolution / _FWHM_SIGMAS) ** 2 * np.eye(2)
         away = places - self.measurement.values[1:]
         squared = np.einsum("ki,ij,kj->k", away, np.linalg.inv(seen), away)
         return np.asarray(squared < _COVERED_SIGMAS**2)
@@ -324,12 +324,12 @@ def wide_field(
 
     Examples
     --------
-    With frames and wavefront maps in folders, which the package does not contain:
+    With frames and OPD maps in folders, which the package does not contain:
 
     >>> import pyklip_diffrender as dr
     >>> frame = dr.Observation.from_fits("roll1_calints.fits")  # doctest: +SKIP
     >>> fit = dr.refine(dr.model_for(frame, 80), frame.cutout(80), "opd.fits")  # doctest: +SKIP
-    >>> wide = dr.wide_field(dr.detect(fit), [frame])  # doctest: +SKIP
+    >>> wide = dr.detection.wide_field(dr.detect(fit), [frame])  # doctest: +SKIP
     """
     threshold = detection.threshold if threshold is None else threshold
     frames = _frames(detection, observations)
@@ -466,10 +466,10 @@ def _search(
         allowed = np.isfinite(snr) & far_from(grid, places, resolution)
         for source in sources:
             # The subtraction of a bright source leaves residuals.
-            near = separation_of(grid - source.values[1:]) < _LOBES
-            allowed &= ~near | (snr > _LEFT * source.snr)
+            near = separation_of(grid - source.values[1:]) < _SUBTRACTION_LOBES_ARCSEC
+            allowed &= ~near | (snr > _LEFT_SNR_RATIO * source.snr)
         peak = significance.next_peak(snr, places, threshold, allowed)
-        if peak is None or len(sources) >= _MOST:
+        if peak is None or len(sources) >= _MOST_SOURCES:
             break
         contrast = float(numerator[peak] / information[peak])
         fitted = _measured(frames, images, grid[peak], contrast)
@@ -478,8 +478,10 @@ def _search(
             outer = outer & far_from(grid, torch.from_numpy(grid[peak][None]), resolution)
             continue
         sources.append(fitted)
-    if len(sources) >= _MOST:
-        _log.warning("more than %d sources in the whole field; the fainter are left out", _MOST)
+    if len(sources) >= _MOST_SOURCES:
+        _log.warning(
+            "more than %d sources in the whole field; the fainter are left out", _MOST_SOURCES
+        )
     kept = _significant(frames, _refined(frames, sources), factor, threshold)
     return information, kept, factor, np.nan_to_num(whole)
 
@@ -534,8 +536,8 @@ def _measured(
     frames: Sequence[WholeFrame], images: Sequence[Image], offset: Image, contrast: float
 ) -> _Measurement | None:
     """Fit a source in every frame and average; None if it is in none of them."""
-    fits = [f.photometry(i, offset, contrast) for f, i in zip(frames, images, strict=True)]
-    usable = [each for each in fits if each is not None]
+    fitted = [f.photometry(i, offset, contrast) for f, i in zip(frames, images, strict=True)]
+    usable = [each for each in fitted if each is not None]
     if not usable:
         return None
     weights = np.array([errors**-2.0 for _, errors, _ in usable])
@@ -565,7 +567,7 @@ def _sources(
         own = [each for each, k in zip(parts, labels, strict=True) if k == number]
         others = [each for each, k in zip(parts, labels, strict=True) if k != number]
         scale = float(factor.at(separation_of(_light_of(own)[0])).mean()) ** 2
-        if len(own) == 1 and own[0].chi2 <= _POINT * scale:
+        if len(own) == 1 and own[0].chi2 <= _POINT_SOURCE_CHI2 * scale:
             return _Source(own[0], own[0].chi2)
         images = [frame.residual - frame.light(*_light_of(others)) for frame in frames]
         return _shaped(frames, images, own, scale, resolution)
@@ -606,11 +608,11 @@ def _is_cut_off(first: WholeFrame, source: _Measurement) -> bool:
     about = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
     height = float(snr[about].max())
     outside = ~first.searches(first.grid)
-    near = separation_of(first.grid - source.values[1:]) < _LOBES
+    near = separation_of(first.grid - source.values[1:]) < _SUBTRACTION_LOBES_ARCSEC
     # The light of sources outside is not subtracted, and neither are their lobes.
-    if (outside & near & (_SADDLE * snr > height)).any():
+    if (outside & near & (_BLENDED_SADDLE_RATIO * snr > height)).any():
         return True
-    labels, _ = label(snr >= _SADDLE * height)
+    labels, _ = label(snr >= _BLENDED_SADDLE_RATIO * height)
     own = np.unique(labels[about])
     return bool((np.isin(labels, own[own > 0]) & outside & (snr > height)).any())
 
@@ -624,7 +626,7 @@ def _blends(first: WholeFrame, parts: Sequence[_Measurement], snr: Image) -> NDA
         steps = np.linspace(0, 1, 2 + int(2 * np.hypot(*(places[i] - places[k]))))
         path = places[i][:, None] * (1 - steps) + places[k][:, None] * steps
         between = map_coordinates(snr, path, order=1).min()
-        linked[i, k] = between >= _SADDLE * min(heights[i], heights[k])
+        linked[i, k] = between >= _BLENDED_SADDLE_RATIO * min(heights[i], heights[k])
     return np.asarray(connected_components(linked, directed=False)[1])
 
 
@@ -645,7 +647,7 @@ def _shaped(
     middle = contrasts @ places / total
     extent = float(separation_of(places - middle).max())
     pixel = float(np.mean(frames[0].observation.pixelscale))
-    size = 2 * min(_BESIDE + math.ceil(extent / pixel), REACH // 2) + 1
+    size = 2 * min(_FITTED_ABOUT_SOURCE_PIXELS + math.ceil(extent / pixel), REACH // 2) + 1
     used = [(f, i) for f, i in zip(frames, images, strict=True) if f.searches(middle)]
     windows = [frame.window_about(middle, size) for frame, _ in used]
     renders = [frame.gaussian(window) for (frame, _), window in zip(used, windows, strict=True)]
@@ -675,7 +677,7 @@ def _shaped(
     root = np.array([[wide.x[3], 0.0], wide.x[4:6]])
     shape = _Shape(root @ root.T)
     gain = 2 * (point.cost - wide.cost)
-    is_wide = gain > _GAIN * scale and shape.major > _WIDTH * resolution
+    is_wide = gain > _SHAPE_CHI2_GAIN * scale and shape.major > _SMALLEST_FWHM_LAMBDA_D * resolution
     best = wide if is_wide else point
     unit = np.array([total, 1.0, 1.0])
     covariance = np.linalg.pinv(best.jac.T @ best.jac)[:3, :3]
@@ -744,13 +746,13 @@ def _curve(
     photon = np.where(information > 0, information, np.nan) ** -0.5
     photon[window] = detection.photon_error
     inner = detection.contrast_curve["separation"].to_value("arcsec")
-    outer = np.arange(inner[-1] + _STEP, separation_of(grid).max(), _STEP)
+    outer = np.arange(inner[-1] + _CURVE_STEP_ARCSEC, separation_of(grid).max(), _CURVE_STEP_ARCSEC)
     rings = ring_pixels(grid, np.concatenate([inner, outer]), most=error.size)
     pixel = abs(grid[0, 1, 0] - grid[0, 0, 0])
     kept, errors, photons = [], [], []
     for separation, ring in zip(np.concatenate([inner, outer]), rings, strict=True):
         valid = np.isfinite(error[ring])
-        if valid.sum() * pixel < _COVERED * 2 * np.pi * separation:
+        if valid.sum() * pixel < _COVERED_RING_SHARE * 2 * np.pi * separation:
             continue
         kept.append(separation)
         errors.append(error[ring][valid])

@@ -24,11 +24,11 @@ from pyklip_diffrender.drawing.figures import (
 from pyklip_diffrender.drawing.images import (
     SNR_LINEAR,
     light_norm,
+    opd_map,
     pupil_image,
     signed_image,
     snr_map,
     star_image,
-    wavefront_map,
 )
 from pyklip_diffrender.drawing.measurements import Epoch, Stamp, corner, sky_track, stamp_panels
 
@@ -45,6 +45,7 @@ __all__ = [
     "light_norm",
     "new_figure",
     "on_sky",
+    "opd_map",
     "panel",
     "pupil_image",
     "save",
@@ -56,6 +57,5 @@ __all__ = [
     "survey_limits",
     "to_png",
     "unit_label",
-    "wavefront_map",
     "wide_panel",
 ]

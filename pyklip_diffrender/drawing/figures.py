@@ -78,13 +78,13 @@ def unit_label(unit: UnitBase) -> str:
 
 # Figures, their axes, and writing them.
 
-_PANEL = (4.6, 3.7)
+_PANEL_INCHES = (4.6, 3.7)
 """Size of a panel, inches: its letters are as large as a page's where it is as wide as a phone."""
 
-_WIDE = (6.8, 5.2)
+_WIDE_PANEL_INCHES = (6.8, 5.2)
 """Size of a wide panel, inches."""
 
-_BOX = (0.17, 0.13, 0.6, 0.77)
+_PANEL_AXES = (0.17, 0.13, 0.6, 0.77)
 """Axes in a panel, the same for all, so that panels side by side are aligned."""
 
 
@@ -121,8 +121,8 @@ def panel() -> tuple[Figure, Axes]:
     """Make a figure with one axes, which a page can put beside others of its kind."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=_PANEL)
-    return figure, figure.add_axes(_BOX)
+    figure = Figure(figsize=_PANEL_INCHES)
+    return figure, figure.add_axes(_PANEL_AXES)
 
 
 def wide_panel() -> tuple[Figure, Axes]:
@@ -130,7 +130,9 @@ def wide_panel() -> tuple[Figure, Axes]:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=_WIDE, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12))
+    figure = Figure(
+        figsize=_WIDE_PANEL_INCHES, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12)
+    )
     return figure, figure.subplots()
 
 

@@ -93,9 +93,7 @@ def snr_map(
     )  # fmt: skip
 
 
-def wavefront_map(
-    ax: Axes, opd: Image, width: float, *, title: str, limit: float | None = None
-) -> None:
+def opd_map(ax: Axes, opd: Image, width: float, *, title: str, limit: float | None = None) -> None:
     """Draw a wavefront error (nm, NaN outside the pupil) on a pupil array of `width` metres.
 
     The scale goes to +-`limit`; by default few pixels exceed it.

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_STAMPS, _CORNER = (4.8, 3.9), (4.8, 4.4)
+_STAMPS_INCHES, _CORNER_INCHES = (4.8, 3.9), (4.8, 4.4)
 """Sizes of figures of several small axes, inches."""
 
-_SIGMAS = (1.0, 2.0)
+_ELLIPSE_SIGMAS = (1.0, 2.0)
 """Ellipses of a corner figure, standard deviations."""
 
-_ON_CURVE = 181
+_POINTS_PER_CURVE = 181
 """Points of a curve."""
 
 
@@ -46,7 +46,9 @@ def stamp_panels(stamp: Stamp, unit: str) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=_STAMPS, layout=ConstrainedLayoutEngine(compress=True, w_pad=0.08))
+    figure = Figure(
+        figsize=_STAMPS_INCHES, layout=ConstrainedLayoutEngine(compress=True, w_pad=0.08)
+    )
     limit = max(float(np.nanmax(np.abs(stamp.model))), 3 * float(np.nanmedian(stamp.noise)))
     signed: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "bar": unit}
     light = {"cmap": "magma", "bar": unit}
@@ -80,17 +82,17 @@ def corner(names: Sequence[str], values: Array, covariance: Array, labels: Seque
     from matplotlib.figure import Figure
 
     count = len(names)
-    figure = Figure(figsize=_CORNER, layout="constrained")
+    figure = Figure(figsize=_CORNER_INCHES, layout="constrained")
     axes: NDArray[Any] = figure.subplots(count, count, sharex="col", squeeze=False)
     errors = np.sqrt(np.diagonal(covariance))
-    turn = np.linspace(0, 2 * np.pi, _ON_CURVE)
+    turn = np.linspace(0, 2 * np.pi, _POINTS_PER_CURVE)
     for row, column in np.ndindex(count, count):
         ax: Axes = axes.item(row, column)
         if column > row:
             ax.set_axis_off()
             continue
         if column == row:
-            steps = np.linspace(-3.5, 3.5, _ON_CURVE)
+            steps = np.linspace(-3.5, 3.5, _POINTS_PER_CURVE)
             bell = np.exp(-(steps**2) / 2)
             ax.fill_between(values[row] + errors[row] * steps, bell, color=ACCENT, alpha=0.15, lw=0)
             ax.plot(values[row] + errors[row] * steps, bell, color=ACCENT)
@@ -103,7 +105,7 @@ def corner(names: Sequence[str], values: Array, covariance: Array, labels: Seque
             # circle.
             root = np.linalg.cholesky(covariance[np.ix_(pair, pair)])
             circle = root @ np.stack([np.cos(turn), np.sin(turn)])
-            for sigmas in _SIGMAS:
+            for sigmas in _ELLIPSE_SIGMAS:
                 x, y = values[pair][:, None] + sigmas * circle
                 ax.plot(x, y, color=ACCENT)
                 ax.fill(x, y, color=ACCENT, alpha=0.12, lw=0)

@@ -31,6 +31,7 @@ from pyklip_diffrender.instrument.spectrum import (
     filter_bandpass,
     filter_throughput,
     planet_spectra,
+    star_flux_density,
 )
 
 __all__ = [
@@ -56,4 +57,5 @@ __all__ = [
     "maskrnd_openings",
     "nircam_coronagraph",
     "planet_spectra",
+    "star_flux_density",
 ]

@@ -81,7 +81,7 @@ class BarMask:
         """Half the sides of the rectangle about the star beyond which the mask is clear, arcsec."""
         # The mask is clear from s = sigma |y| = 2 pi on, which is farthest out where the bar is
         # widest.
-        x = min(_HALF_BAR + abs(self.offset), self.longest or math.inf)
+        x = min(_HALF_BAR_ARCSEC + abs(self.offset), self.longest or math.inf)
         widest = self._width(torch.tensor([-x, x], dtype=torch.float64) + self.offset).max()
         return x, 2 * math.pi / float(self.scale(float(widest)))
 
@@ -92,13 +92,13 @@ class BarMask:
         x, y = torch.broadcast_tensors(x, y)
         on_bar = x + self.offset
         s = torch.as_tensor(self.scale(self._width(on_bar).numpy())) * y.abs()
-        inside = (s < 2 * math.pi) & (on_bar.abs() <= _HALF_BAR) & (x.abs() <= self.reach[0])
+        inside = (s < 2 * math.pi) & (on_bar.abs() <= _HALF_BAR_ARCSEC) & (x.abs() <= self.reach[0])
         return torch.where(inside, torch.sinc(s / math.pi) ** 2, 0.0)
 
     def _width(self, on_bar: Tensor) -> Tensor:
         """Half width at half maximum, lambda/D, at places along the bar, arcsec from its middle."""
-        narrow, wide = _WIDTHS
-        along = 0.5 + self.widens * on_bar / (2 * _HALF_WEDGE)
+        narrow, wide = _BAR_HALF_WIDTHS_LAMBDA_D
+        along = 0.5 + self.widens * on_bar / (2 * _HALF_WEDGE_ARCSEC)
         return (narrow + (wide - narrow) * along).clamp(narrow, wide)
 
     def at(self, offset: float, longest: float | None = None) -> Self:
@@ -106,13 +106,13 @@ class BarMask:
         return replace(self, offset=offset, longest=longest)
 
 
-_HALF_BAR = 10.0
+_HALF_BAR_ARCSEC = 10.0
 """Half the length of a bar, arcsec."""
 
-_HALF_WEDGE = 7.5
+_HALF_WEDGE_ARCSEC = 7.5
 """Half the length of the part in which its width changes, arcsec."""
 
-_WIDTHS = (2.0, 6.0)
+_BAR_HALF_WIDTHS_LAMBDA_D = (2.0, 6.0)
 """Half width at half maximum of the narrow and of the wide end, lambda/D."""
 
 # Highest power first, as in stpsf.

@@ -56,7 +56,7 @@ _WEDGE_TILT = (
     Polynomial([3240.7584, -1620.3792]) * 1e-9,
     Polynomial([12515.1242, -8683.2786, 1939.0256, -134.9596]) * 1e-9,
 )
-_TABULATED_AT = (2.12, 3.23)
+_TABULATED_WAVELENGTHS_MICRON = (2.12, 3.23)
 """Wavelengths of the tabulated wavefront error, micron."""
 
 _MIRRORED = {"MASKSWB": "MASKLWB", "MASKLWB": "MASKSWB"}
@@ -81,7 +81,7 @@ class ChromaticAberration:
         focus, tilt = _FOCUS[channel], _WEDGE_TILT[channel]
         return {
             3: float(-(tilt(wavelength * 1e6) - tilt(self.reference * 1e6))),
-            4: float(-(focus(wavelength * 1e6) - focus(_TABULATED_AT[channel]))),
+            4: float(-(focus(wavelength * 1e6) - focus(_TABULATED_WAVELENGTHS_MICRON[channel]))),
         }
 
 
@@ -145,7 +145,7 @@ _IPC_NRCA5 = np.array(
 _PPC_NRCA5 = np.array([[0.0, 0.99876965, 0.00123035]])
 
 
-_OPENINGS = {"MASKRND": maskrnd_openings, "MASKBAR": maskbar_openings}
+_LYOT_OPENINGS = {"MASKRND": maskrnd_openings, "MASKBAR": maskbar_openings}
 """The Lyot stops, in both channels."""
 
 
@@ -335,7 +335,7 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
 
 
 def _require_supported(place: DetectorPlace, recipe: Mapping[str, Any]) -> None:
-    if recipe["pupil_mask"] not in (None, *_OPENINGS):
+    if recipe["pupil_mask"] not in (None, *_LYOT_OPENINGS):
         raise IncompatibleSetupError(
             f"pupil_mask: got {recipe['pupil_mask']!r}, expected 'auto', 'MASKRND', 'MASKBAR' or "
             "None"
@@ -410,7 +410,7 @@ def _planes(place: DetectorPlace, bandpass: Bandpass, recipe: Mapping[str, Any])
     if recipe["pupil_mask"] is not None:
         planes.append(
             LyotStop(
-                _OPENINGS[recipe["pupil_mask"]](),
+                _LYOT_OPENINGS[recipe["pupil_mask"]](),
                 recipe["npix"],
                 JWST_DIAMETER,
                 dtype,

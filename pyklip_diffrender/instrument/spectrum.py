@@ -141,11 +141,11 @@ _DESCRIPTION = re.compile(
     r"\s*(?P<type>[BAFGKM]\d(?:\.\d+)?)V?\s*,\s*K\s*=\s*(?P<magnitude>[-+]?\d+(?:\.\d*)?)\s*"
 )
 
-_WAVELENGTHS = native_float64([1.235e-6, 1.662e-6, 2.159e-6, 3.3526e-6, 4.6028e-6])
-_ZERO_POINTS = native_float64([1594.0, 1024.0, 666.8, 309.54, 171.787])
+_BANDS_M = native_float64([1.235e-6, 1.662e-6, 2.159e-6, 3.3526e-6, 4.6028e-6])
+_ZERO_POINTS_JY = native_float64([1594.0, 1024.0, 666.8, 309.54, 171.787])
 """Flux density of magnitude 0 in J, H, Ks, W1 and W2, Jy."""
 
-_END = 5.2e-6
+_END_M = 5.2e-6
 """Wavelength to which the spectrum is continued, m, as the power law from W1 to W2."""
 
 
@@ -166,11 +166,11 @@ def _dwarf(match: re.Match[str]) -> _Spectrum:
     )
     ks = float(match["magnitude"])
     magnitudes = native_float64([ks + h_ks + j_h, ks + h_ks, ks, ks - ks_w1, ks - ks_w1 - w1_w2])
-    flux = _ZERO_POINTS * 10 ** (-0.4 * magnitudes)
+    flux = _ZERO_POINTS_JY * 10 ** (-0.4 * magnitudes)
     # F = a lambda^slope through W1 and W2.
-    slope = np.log(flux[-1] / flux[-2]) / np.log(_WAVELENGTHS[-1] / _WAVELENGTHS[-2])
-    end = flux[-1] * (_END / _WAVELENGTHS[-1]) ** slope
-    return np.append(_WAVELENGTHS, _END), np.append(flux, end)
+    slope = np.log(flux[-1] / flux[-2]) / np.log(_BANDS_M[-1] / _BANDS_M[-2])
+    end = flux[-1] * (_END_M / _BANDS_M[-1]) ** slope
+    return np.append(_BANDS_M, _END_M), np.append(flux, end)
 
 
 def _place(name: str) -> float:
@@ -180,12 +180,12 @@ def _place(name: str) -> float:
 
 # Flux density of a star in a filter, from its spectrum, its photometry or its spectral type.
 
-_GAP = 1.6
+_LARGEST_SAMPLE_STEP = 1.6
 """Largest step between samples, as a fraction of the wavelength, over which a power law is a fair
 continuum of a star. Infrared photometry has points at 2.16, 3.35, 4.60 and 11.6 micron."""
 
-_RANGE = (2e-6, 5.2e-6)
-"""Wavelengths, m, between which steps must be smaller than `_GAP`."""
+_RANGE_M = (2e-6, 5.2e-6)
+"""Wavelengths, m, between which steps must be smaller than `_LARGEST_SAMPLE_STEP`."""
 
 
 def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
@@ -232,12 +232,12 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder, "star.txt")
     ...     _ = path.write_text("# um Jy\n3.0 0.9\n4.0 0.5\n5.0 0.3\n6.0 0.2\n")
-    ...     print(dr.star_flux_density(path, "F444W").round(3))
+    ...     print(dr.instrument.star_flux_density(path, "F444W").round(3))
     0.411 Jy
 
     A2V with the K magnitude of HIP 65426:
 
-    >>> print(dr.star_flux_density("A2V, K=6.77", "F444W").round(3))
+    >>> print(dr.instrument.star_flux_density("A2V, K=6.77", "F444W").round(3))
     0.378 Jy
     """
     dwarf = _DESCRIPTION.fullmatch(str(star))
@@ -296,14 +296,14 @@ def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
     if level.unit is None:
         _log.warning("%s has no units; micron and Jy are assumed", path)
     wavelength, flux = _samples(path, axis, level)
-    require_star(np.interp(_REFERENCE, wavelength, flux), f"{path}: {level.name}")
-    used = (wavelength[1:] > _RANGE[0]) & (wavelength[:-1] < _RANGE[1])
+    require_star(np.interp(_REFERENCE_WAVELENGTH_M, wavelength, flux), f"{path}: {level.name}")
+    used = (wavelength[1:] > _RANGE_M[0]) & (wavelength[:-1] < _RANGE_M[1])
     step = np.where(used, np.diff(wavelength) / wavelength[:-1], 0.0)
-    if step.max() > _GAP:
+    if step.max() > _LARGEST_SAMPLE_STEP:
         before, after = 1e6 * wavelength[step.argmax() : step.argmax() + 2]
         raise IncompatibleSetupError(
             f"{path}: no sample between {before:.2f} and {after:.2f} micron, expected steps of at "
-            f"most {100 * _GAP:.0f} % of the wavelength"
+            f"most {100 * _LARGEST_SAMPLE_STEP:.0f} % of the wavelength"
         )
     return wavelength, flux
 
@@ -311,7 +311,7 @@ def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
 def require_star(jansky: float, name: str) -> None:
     """Raise IncompatibleSetupError for a flux density, Jy, that no star has in the filters."""
     others = ("uJy", "W / (m2 um)", "erg / (s cm2 Angstrom)", "erg / (s cm2 Hz)")
-    _require_overlap((jansky, jansky), _STARS, "Jy", others, name)
+    _require_overlap((jansky, jansky), _STAR_FLUX_RANGE_JY, "Jy", others, name)
 
 
 def _require_overlap(
@@ -322,7 +322,7 @@ def _require_overlap(
     name: str,
 ) -> None:
     """Raise IncompatibleSetupError for numbers out of a range, with units that may be meant."""
-    equivalences = u.spectral() + u.spectral_density(_REFERENCE * u.m)
+    equivalences = u.spectral() + u.spectral_density(_REFERENCE_WAVELENGTH_M * u.m)
 
     def overlaps(other: str) -> bool:
         low, high = (found * u.Unit(other)).to_value(unit, equivalences)
@@ -339,11 +339,11 @@ def _require_overlap(
 
 # Tables of spectra, whose units are written in many places.
 
-_STARS = (1e-6, 1e5)
+_STAR_FLUX_RANGE_JY = (1e-6, 1e5)
 """Flux densities of stars from 2 to 5.2 micron, Jy: the brightest is R Doradus with 3e4 Jy, and
 1e-6 Jy is the AB magnitude 24."""
 
-_REFERENCE = 3.2e-6
+_REFERENCE_WAVELENGTH_M = 3.2e-6
 """Wavelength in the middle of the filters, m."""
 
 _AXES = ("length", "frequency", "wavenumber")
@@ -363,7 +363,7 @@ _IS_ERROR = re.compile(
 )
 """Part of the name, the description or the UCD of a column of errors."""
 
-_NAME = re.compile(r"[^\s,;|()\[\]]+(?:\s*(?:\((?:[^()]|\([^()]*\))*\)|\[[^\]]*\]))?")
+_COLUMN_NAME = re.compile(r"[^\s,;|()\[\]]+(?:\s*(?:\((?:[^()]|\([^()]*\))*\)|\[[^\]]*\]))?")
 """Name of a column in a comment, with the unit in brackets."""
 
 
@@ -398,7 +398,7 @@ def _columns(path: Path, expected: str) -> tuple[Column, list[Column]]:
                 for each in table.columns.values()
                 if each.dtype.kind in "fiu" and each.ndim == 1 and not _is_error(each)
             ]
-            mentioned = [_unit_in(name) for line in comments for name in _NAME.findall(line)]
+            mentioned = [_unit_in(name) for line in comments for name in _COLUMN_NAME.findall(line)]
     except UnitError as error:
         raise IncompatibleSetupError(f"{path}: {error}") from error
     except DiffrenderError:
@@ -430,7 +430,7 @@ def _columns(path: Path, expected: str) -> tuple[Column, list[Column]]:
         if re.match(r"(?i)(sed_)?(freq|nu)", axis.name):
             raise _unclear(path, columns, "a unit of frequencies")
         _require_overlap(
-            (np.nanmin(axis), np.nanmax(axis)), (1e6 * _RANGE[0], 1e6 * _RANGE[1]), "micron",
+            (np.nanmin(axis), np.nanmax(axis)), (1e6 * _RANGE_M[0], 1e6 * _RANGE_M[1]), "micron",
             ("Angstrom", "nm", "m"), f"{path}: {axis.name}, which has no unit",
         )  # fmt: skip
     return axis, [each for each in columns if each is not axis]
@@ -459,7 +459,7 @@ def _table(path: Path) -> tuple[Table, list[str]]:
     comments = [line.strip("# \t") for line in above]
     if table.colnames[0] == "col1":
         for line in comments:
-            names = _NAME.findall(line)
+            names = _COLUMN_NAME.findall(line)
             if (
                 len(names) == len(table.columns)
                 and any(_IS_AXIS.match(each) or _is(_unit_in(each), _AXES) for each in names)
@@ -527,7 +527,7 @@ TEMPERATURES = (150, 175, 200, 250, 300, 350, 400, 500, 600, 750, 900, 1200, 150
 """Temperatures of black bodies, K. Neighbours differ so little that a search of F356W and F444W of
 equal depth loses at most 0.2 % of the S/N of a planet between them."""
 
-_SAMPLES = np.geomspace(0.5e-6, 8e-6, 2001)
+_SAMPLES_M = np.geomspace(0.5e-6, 8e-6, 2001)
 """Wavelengths of black bodies, m, which include every filter's."""
 
 
@@ -586,12 +586,12 @@ def planet_spectra(
         if request == "flat":
             rows.append(("flat", [1.0] * len(filters)))
         elif request == "blackbody":
-            frequency = u.Quantity(_SAMPLES, u.m).to(u.Hz, u.spectral())
+            frequency = u.Quantity(_SAMPLES_M, u.m).to(u.Hz, u.spectral())
             for temperature in TEMPERATURES:
                 name = f"black body of {temperature} K"
                 flux = native_float64(BlackBody(temperature * u.K)(frequency).value)
                 rows.append(
-                    (name, [mean_in_filter(_SAMPLES, flux, each, name) for each in filters])
+                    (name, [mean_in_filter(_SAMPLES_M, flux, each, name) for each in filters])
                 )
         else:
             found, lost = _spectra_in_file(Path(request), filters)

@@ -33,27 +33,27 @@ from pyklip_diffrender.errors import (
 
 _GZIP = b"\x1f\x8b"
 
-_IN_MEMORY = 2**25
+_UNPACKED_IN_MEMORY_BYTES = 2**25
 """Bytes up to which a gzipped file is unpacked in memory, which is faster."""
 
-_CHUNK = 2**22
+_CHUNK_BYTES = 2**22
 """Bytes that are read at once, a multiple of the words that are summed."""
 
 _PACKED = re.compile(r"\.(gz|fz)$", re.IGNORECASE)
 """Suffixes of gzip and fpack."""
 
-_SUFFIX = re.compile(r"\.(fits?|fts)(\.gz|\.fz)?$", re.IGNORECASE)
+_FITS_SUFFIX = re.compile(r"\.(fits?|fts)(\.gz|\.fz)?$", re.IGNORECASE)
 """The suffixes of FITS files that `open_fits` reads."""
 
 
 def is_fits_name(path: str | os.PathLike[str]) -> bool:
     """Whether a path has the suffix of a FITS file, packed or not, in any case ("B.FIT.GZ")."""
-    return _SUFFIX.search(os.fspath(path)) is not None
+    return _FITS_SUFFIX.search(os.fspath(path)) is not None
 
 
 def without_fits_suffix(name: str) -> str:
     """Name of a FITS file without the suffix, packed or not; other names are unchanged."""
-    return _SUFFIX.sub("", name)
+    return _FITS_SUFFIX.sub("", name)
 
 
 def unpacked_name(name: str) -> str:
@@ -85,10 +85,10 @@ def read_text(path: str | os.PathLike[str]) -> str:
     return Path(path).read_text(encoding="utf-8-sig")
 
 
-_PRODUCTS = {
+_PRODUCT_EXTENSIONS = {
     "INITIAL_OPD": "a fit",
     "RESIDUAL_SNR": "a search",
-    "PATTERN": "a flat-field pattern",
+    "PATTERN": "a detector pattern",
 }
 """Extensions by which products of this package are known; their headers are copied from frames."""
 
@@ -97,9 +97,9 @@ def product_in(hdus: fits.HDUList) -> str:
     """Name of this package's product in an open file, such as "a fit"; empty for other files."""
     header = hdus[0].header
     if "PATVERS" in header:
-        return "a library of flat-field patterns"
+        return "a library of detector patterns"
     names = [hdu.name for hdu in hdus]
-    known = (what for name, what in _PRODUCTS.items() if name in names)
+    known = (what for name, what in _PRODUCT_EXTENSIONS.items() if name in names)
     return next(known, "an image" if "DRVERS" in header else "")
 
 
@@ -164,12 +164,12 @@ def _unpacked(path: Path) -> Iterator[BinaryIO]:
             yield file
             return
         # Not by astropy, which mistakes a truncated stream for the end of the file.
-        if path.stat().st_size <= _IN_MEMORY:
+        if path.stat().st_size <= _UNPACKED_IN_MEMORY_BYTES:
             yield io.BytesIO(gzip.decompress(path.read_bytes()))
             return
         file.seek(0)
         with gzip.GzipFile(fileobj=file) as stream:
-            while stream.read(_CHUNK):
+            while stream.read(_CHUNK_BYTES):
                 pass
             stream.seek(0)
             yield stream  # type: ignore[misc]
@@ -243,7 +243,7 @@ def _ones_complement(file: BinaryIO, begin: int, length: int) -> int:
     file.seek(begin)
     total = 0
     while length > 0:
-        words = np.frombuffer(file.read(min(length, _CHUNK)), dtype=">u4")
+        words = np.frombuffer(file.read(min(length, _CHUNK_BYTES)), dtype=">u4")
         if not len(words):
             raise EOFError("the data end before they should")
         total += int(words.sum(dtype=np.uint64))

@@ -23,7 +23,7 @@ _SIMBAD = re.compile(r"(V|NAME|\*+)?\*?[\s_-]+", re.IGNORECASE)
 """Prefixes of names in SIMBAD, and of observers after it: V* AU Mic, V-AU-MIC, * bet Pic."""
 
 
-_SLIP = 0.6
+_SLIP_SIMILARITY = 0.6
 """Least similarity of the digits of two names if one is a slip: one of three digits is wrong."""
 
 _SIGN = re.compile(r"\+(?=\s*\d)")
@@ -57,7 +57,7 @@ def _alike_numbers(first: str, second: str) -> bool:
     one, other = ("".join(filter(str.isdigit, name)) for name in (first, second))
     if not (one and other):
         return True
-    return difflib.SequenceMatcher(None, one, other).ratio() >= _SLIP
+    return difflib.SequenceMatcher(None, one, other).ratio() >= _SLIP_SIMILARITY
 
 
 def _plain(name: str) -> str:
@@ -75,7 +75,7 @@ def _bare(name: str) -> str:
 _DATED_NAME = re.compile(r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)")
 """A date in the name of a file: opd_2022-08-14.fits.gz, R2022081402-NRCA3_FP1-1.fits."""
 
-_UNKNOWN = ("", "UNKNOWN", "NULL", "N/A", "UNDEFINED")
+_NOTHING_STATED = ("", "UNKNOWN", "NULL", "N/A", "UNDEFINED")
 """Texts of cards that state nothing."""
 
 
@@ -137,7 +137,7 @@ def header_number(header: fits.Header, key: str, name: str) -> float | None:
     None if the card is missing, empty, or says that its value is not known.
     """
     value = _value(header, key)
-    if value is None or (isinstance(value, str) and value.strip().upper() in _UNKNOWN):
+    if value is None or (isinstance(value, str) and value.strip().upper() in _NOTHING_STATED):
         return None
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise card_error(name, key, value, "a finite number")
@@ -153,7 +153,7 @@ def header_text(header: fits.Header, key: str, name: str) -> str | None:
     if value is not None and not isinstance(value, str):
         raise card_error(name, key, value, "text")
     text = (value or "").strip()
-    return None if text.upper() in _UNKNOWN else text
+    return None if text.upper() in _NOTHING_STATED else text
 
 
 def known_number(header: fits.Header, key: str) -> float | None:
@@ -171,7 +171,7 @@ def known_text(header: fits.Header, key: str) -> str | None:
     """Text of a card, also of a number; None if it is missing, or says that it is not known."""
     value = _value(header, key)
     text = "" if value is None else str(value).strip()
-    return None if text.upper() in _UNKNOWN else text
+    return None if text.upper() in _NOTHING_STATED else text
 
 
 def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time | None:
@@ -204,7 +204,7 @@ def day_and_time(header: fits.Header, name: str) -> Time | None:
 
 
 def sensing_date(header: fits.Header, name: str) -> Time | None:
-    """Date (UTC) at which a wavefront map was sensed, None if it is not known.
+    """Date (UTC) at which an OPD map was sensed, None if it is not known.
 
     The date is DATE-OBS with TIME-OBS, as MAST and stpsf write them, DATE-OBS alone, DATE-BEG, or
     else the date in the name of the file, `name`. CorruptFileError if the cards do not hold a date.
@@ -224,7 +224,7 @@ def sensing_date(header: fits.Header, name: str) -> Time | None:
 
 # The package's own FITS keywords: one declaration of their names, comments and meanings.
 
-_PIPELINE = u.MJy / u.sr
+_PIPELINE_UNIT = u.MJy / u.sr
 
 
 @dataclass(frozen=True)
@@ -266,14 +266,14 @@ _DECLARED = (
             "Of several fits, the largest number. Their light is not subtracted."),
     Keyword("DRSECS", "[s] duration of the refinement", "reduce"),
     Keyword("DRFILT", "filter of the model", "pyKLIP"),
-    Keyword("DROPD", "wavefront map at the start", "reduce, pyKLIP",
+    Keyword("DROPD", "OPD map at the start", "reduce, pyKLIP",
             "Name of its file, or `flat wavefront`."),
     Keyword("DRSHA256", "", "reduce, pyKLIP",
-            "SHA-256 of the file of the wavefront map, or of its array."),
-    Keyword("DROPDDAT", "date of the wavefront map", "pyKLIP", "Only for maps with a date."),
+            "SHA-256 of the file of the OPD map, or of its array."),
+    Keyword("DROPDDAT", "date of the OPD map", "pyKLIP", "Only for maps with a date."),
     Keyword("DROPDHRS", "[h] from the frames to the map", "pyKLIP",
             "From their mean date; negative for an earlier map."),
-    Keyword("DRSYST", "flat-field pattern", "reduce, pyKLIP",
+    Keyword("DRPATTRN", "detector pattern", "reduce, pyKLIP",
             "Its name, which lists the stars that it was learned from, or `none`."),
     Keyword("DRREFS", "reference frames that were used", "pyKLIP",
             "Integrations to which wavefront or pattern were fitted."),
@@ -314,7 +314,7 @@ def set_keyword(header: fits.Header, name: str, value: Any) -> None:
 
 def fits_unit(unit: u.UnitBase) -> str:
     """A unit for BUNIT: "MJy/sr" as JWST's pipeline spells its own, "adu s-1" as FITS does."""
-    if unit == _PIPELINE:
+    if unit == _PIPELINE_UNIT:
         return "MJy/sr"
     try:
         return str(unit.to_string("fits"))

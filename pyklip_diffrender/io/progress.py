@@ -26,7 +26,7 @@ _LISTENER: ContextVar[Callable[[str], None] | None] = ContextVar("listener", def
 _BUSY: ContextVar[bool] = ContextVar("busy", default=False)
 """Whether a bar is shown already; bars inside it are not."""
 
-_INTERVAL = 60.0
+_LOG_INTERVAL_SECONDS = 60.0
 """Shortest time between two lines of a bar in the log, s."""
 
 _COUNTED = "{desc}: {percentage:3.0f} % [{elapsed}<{remaining}]"
@@ -57,7 +57,7 @@ def heartbeat(say: Callable[[], str]) -> Iterator[None]:
     ended = threading.Event()
 
     def beat() -> None:
-        while not ended.wait(_INTERVAL):
+        while not ended.wait(_LOG_INTERVAL_SECONDS):
             _log.info("%s", say())
 
     thread = threading.Thread(target=beat, daemon=True)
@@ -137,7 +137,7 @@ class ProgressBar:
         text = ", ".join([self._name, *(f"{key} {value:.3g}" for key, value in values.items())])
         self._bar.set_description_str(text, refresh=False)
         self._bar.update(steps)
-        if not self._nested and time.monotonic() - self._logged >= _INTERVAL:
+        if not self._nested and time.monotonic() - self._logged >= _LOG_INTERVAL_SECONDS:
             self._logged = time.monotonic()
             of = "" if self._total is None else f" of {self._total}"
             _log.info("%s, step %d%s", text, self._steps, of)

@@ -123,7 +123,7 @@ def pixel_pieces(pixels: int) -> list[slice]:
 #
 # 1. Noise of the frame and errors of the model that are independent from pixel to pixel. Its
 #    standard deviation is 1 / w_f.
-# 2. The error of the flat-field pattern, where frames show the same pixels of the detector. A
+# 2. The error of the detector pattern, where frames show the same pixels of the detector. A
 #    pattern m_p with a Gaussian prior of width g_p multiplies the starlight of every frame: g_p^2
 #    s_fp s_f'p in pixel p.
 #
@@ -275,9 +275,9 @@ class LinearModel:
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
+    >>> fit = dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=6))
     >>> fit.linear
     <LinearModel: 173 unknowns, 1 x 32 x 32 pixels>
     >>> fit.linear.covariance.shape

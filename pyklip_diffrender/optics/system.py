@@ -40,7 +40,7 @@ REFUSED = {
 }
 """Keywords of `calc_psf` of poppy's `OpticalSystem` that no system serves, and why."""
 
-_BAND = ("monochromatic", "nlambda", "source", "wavelength")
+_BAND_SETTINGS = ("monochromatic", "nlambda", "source", "wavelength")
 """Settings that determine the wavelengths."""
 
 
@@ -88,7 +88,7 @@ class OpticalSystem(Propagation):
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> model.parameters[:2]
     ('star_offset', 'lyot_shift')
     >>> star = model(opd.data, star_offset=(0.01, 0.0))
@@ -178,7 +178,7 @@ class OpticalSystem(Propagation):
             )
         changes = {name: value for name, value in changes.items() if name in self.adjustable}
         bandpass = changes.pop("bandpass", None)
-        if bandpass is None and changes.keys().isdisjoint(_BAND):
+        if bandpass is None and changes.keys().isdisjoint(_BAND_SETTINGS):
             bandpass = self._other_bandpass
         system = self._remade(changes) if changes else self
         return system if bandpass is None else system.at_wavelengths(bandpass)
@@ -388,7 +388,7 @@ class OpticalSystem(Propagation):
         drawing.pupil_image(
             pupil, first / first.max(), width, bar="amplitude", title=self.entrance.name
         )
-        drawing.wavefront_map(phase, map_, width, title="wavefront error")
+        drawing.opd_map(phase, map_, width, title="wavefront error")
         drawing.pupil_image(
             last, behind, width, bar="light, 1 in the first pupil",
             title="light in the last pupil", logarithmic=True,

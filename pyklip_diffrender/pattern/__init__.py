@@ -1,6 +1,6 @@
 """Everything that is learned of the flat field's error, and how fits of a target use it.
 
-Fits themselves only know `Systematics`, the pattern with its uncertainty.
+Fits themselves only know `DetectorPattern`, the pattern with its uncertainty.
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ from pyklip_diffrender.pattern.choice import (
     PatternRequest,
     ReferenceFrames,
     as_request,
-    choose_systematics,
+    choose_pattern,
     fit_with_pattern,
     is_known_beside,
     pattern_for_visit,
     place_on_detector,
     with_known_pattern,
 )
-from pyklip_diffrender.pattern.learn import learn_library
+from pyklip_diffrender.pattern.learn import learn_patterns
 from pyklip_diffrender.pattern.library import (
     PatternLibrary,
     combine_libraries,
-    known_systematics,
+    known_pattern,
     package_library,
 )
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
     lacks_pattern,
-    learn_systematics,
+    learn_pattern,
     measure_patterns,
     pattern_pedestal,
     pattern_size,
@@ -41,15 +41,15 @@ __all__ = [
     "PatternRequest",
     "ReferenceFrames",
     "as_request",
-    "choose_systematics",
+    "choose_pattern",
     "combine_libraries",
     "combine_patterns",
     "fit_with_pattern",
     "is_known_beside",
-    "known_systematics",
+    "known_pattern",
     "lacks_pattern",
-    "learn_library",
-    "learn_systematics",
+    "learn_pattern",
+    "learn_patterns",
     "measure_patterns",
     "package_library",
     "pattern_for_visit",

@@ -1,4 +1,4 @@
-"""The choice of the flat-field pattern: of the library, of reference stars, or none."""
+"""The choice of the detector pattern: of the library, of reference stars, or none."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern.library import (
     PatternLibrary,
     combine_libraries,
-    known_systematics,
+    known_pattern,
     package_library,
 )
 from pyklip_diffrender.pattern.measure import flat_of, lacks_pattern, measure_patterns
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import FitSettings, settings_for
 from pyklip_diffrender.scene.admission import epochs_of
 from pyklip_diffrender.scene.aligned_frames import shift_frames, shift_variances
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern, shows_star
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics, shows_star
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # Find which pixels of the detector frames show, from the pattern of the flat field itself.
@@ -43,26 +43,26 @@ from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 _log = logging.getLogger(__name__)
 
-_REACH = 3.0
+_REACH_PIXELS = 3.0
 """Pixels by which stars behind the same mask may be apart."""
 
-_COARSE, _FINE = 0.25, 0.05
+_COARSE_PIXELS, _FINE_PIXELS = 0.25, 0.05
 """Steps of the search, pixels."""
 
-_SIGNIFICANT = 6.0
+_PEAK_SCATTERS = 6.0
 """Height of the peak in units of the correlation's scatter elsewhere."""
 
-_SEPARATE = 1.5
+_PEAK_RADIUS_PIXELS = 1.5
 """Distance from the peak beyond which the correlation measures its scatter, pixels."""
 
 _MODEL_ERROR = 0.05
 """Error of the ratio of residual and star that the pattern does not explain."""
 
-_INNER = 0.3
+_INNER_ARCSEC = 0.3
 """Smallest separation used, arcsec. Closer in, the ratio is dominated by errors of the model."""
 
 
-def place_on_detector(fit: Refinement, pattern: Systematics) -> Observation | None:
+def place_on_detector(fit: Refinement, pattern: DetectorPattern) -> Observation | None:
     """Move the frames of a fit onto the pixels of the detector that a pattern was measured on.
 
     The frames are of one observation and were fitted without a pattern. The result is shifted by
@@ -74,7 +74,7 @@ def place_on_detector(fit: Refinement, pattern: Systematics) -> Observation | No
         return None
     # Stars behind the same mask are within a few pixels of each other on the detector, so the
     # pattern is first put with its star on the frame's star, to whole pixels. The search then moves
-    # it by up to `_REACH` pixels in steps, and about the best place in finer ones.
+    # it by up to `_REACH_PIXELS` pixels in steps, and about the best place in finer ones.
     start = np.round(np.subtract(measured.center, pattern.center)).astype(int)
     column, row = np.subtract(pattern.first_pixel, start).tolist()
     expected = pattern.at(replace(observation, first_pixel=(column, row)))[0]
@@ -82,19 +82,19 @@ def place_on_detector(fit: Refinement, pattern: Systematics) -> Observation | No
     scale_x, scale_y = frame.model.detector.pixelscale
     distance = np.hypot((x - measured.center[0]) * scale_x, (y - measured.center[1]) * scale_y)
     # Inverse variances of the ratio, from its noise and from the errors of the model.
-    weight = np.where(distance > _INNER, 1 / (measured.variance + _MODEL_ERROR**2), 0.0)
-    steps = np.arange(-_REACH, _REACH + _COARSE / 2, _COARSE)
+    weight = np.where(distance > _INNER_ARCSEC, 1 / (measured.variance + _MODEL_ERROR**2), 0.0)
+    steps = np.arange(-_REACH_PIXELS, _REACH_PIXELS + _COARSE_PIXELS / 2, _COARSE_PIXELS)
     coarse = _correlation(measured.value, expected, weight, steps, steps)
     row, column = np.unravel_index(int(coarse.argmax()), coarse.shape)
     best = np.array([steps[column], steps[row]])
     # Beyond its peak the correlation scatters as it would without the pattern.
-    elsewhere = np.hypot(*np.meshgrid(steps - best[0], steps - best[1])) > _SEPARATE
+    elsewhere = np.hypot(*np.meshgrid(steps - best[0], steps - best[1])) > _PEAK_RADIUS_PIXELS
     scatter = float(coarse[elsewhere].std())
     _log.info("pattern seen at %s pixels, correlation %.2f, elsewhere %.3f",
               best, coarse.max(), scatter)  # fmt: skip
-    if coarse.max() < _SIGNIFICANT * scatter:
+    if coarse.max() < _PEAK_SCATTERS * scatter:
         return None
-    nearby = np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
+    nearby = np.arange(-_COARSE_PIXELS, _COARSE_PIXELS + _FINE_PIXELS / 2, _FINE_PIXELS)
     fine = _correlation(measured.value, expected, weight, best[0] + nearby, best[1] + nearby)
     row, column = np.unravel_index(int(fine.argmax()), fine.shape)
     moved = start + best + (nearby[column], nearby[row])
@@ -140,7 +140,7 @@ def _correlation(
     return correlation
 
 
-PatternRequest: TypeAlias = Systematics | PatternLibrary | Literal["auto", "references", "off"]
+PatternRequest: TypeAlias = DetectorPattern | PatternLibrary | Literal["auto", "references", "off"]
 
 ReferenceFrames: TypeAlias = Sequence[Observation] | Callable[[], Sequence[Observation]]
 """Frames of reference stars, or a function that reads them where they are needed."""
@@ -152,7 +152,7 @@ _KNOWN_MODEL_ERROR = 0.002
 """Smallest model error, as a fraction of the star, where the pattern is known from other stars: the
 pattern's own error is counted apart."""
 
-_ROUGH: dict[str, Any] = {
+_ROUGH_SETTINGS: dict[str, Any] = {
     "min_model_error": 0.05,
     "tolerance": 0.05,
     "adapt_prior": False,
@@ -162,11 +162,11 @@ _ROUGH: dict[str, Any] = {
 as soon as it dominates the residual: in thirteen frames of four stars, places differed by at most
 0.05 pixel from the headers or from full fits."""
 
-_TURNED = 1.0
+_OTHER_ROLL_DEG = 1.0
 """Degrees between rolls from which they tell a planet from the pattern: a pixel at 3.6 arcsec."""
 
-_TYPICAL_PATTERN = 0.03
-_TYPICAL_PEDESTAL = 1.9
+_TYPICAL_PATTERN_RMS = 0.03
+_TYPICAL_PEDESTAL_MJY_SR = 1.9
 """Rms of the pattern, and pedestal in MJy/sr, that describe the residuals of the library's stars at
 all separations."""
 
@@ -178,9 +178,9 @@ class PatternChoice:
     # Frames of the target, moved onto the pixels of the pattern where their files do not say which
     # pixels they have.
     science: tuple[Observation, ...]
-    systematics: Systematics | None
+    pattern: DetectorPattern | None
     # Settings of the target's fit.
-    settings: GaussNewton | None
+    settings: FitSettings | None
     # One fit for each reference star that was fitted.
     references: tuple[Refinement, ...] = ()
     # Reference stars that could not be fitted, and why.
@@ -195,14 +195,14 @@ class PatternChoice:
     @property
     def label(self) -> str:
         """The origin of the pattern in a few words, with the names of its stars."""
-        if self.systematics is None:
+        if self.pattern is None:
             return "none"
         if self.origin in ("given", "rolls"):
-            name = self.systematics.name
+            name = self.pattern.name
             return f"given ({name})" if self.origin == "given" else name
         fitted = [frame.observation.target for fit in self.references for frame in fit.frames]
         own = list(dict.fromkeys(fitted))
-        others = [n for n in self.systematics.provenance.get("stars", []) if n not in own]
+        others = [n for n in self.pattern.provenance.get("stars", []) if n not in own]
         parts = (("references", own), ("library", others))
         return ", ".join(f"{origin} ({', '.join(names)})" for origin, names in parts if names)
 
@@ -216,8 +216,8 @@ class PatternChoice:
         if self.origin == "library":
             known = {each.flat for each in self.library.matching(self.science[0])}
             return next((e for e in self.science if None in known or known != {flat_of(e)}), None)
-        if self.origin == "given" and self.systematics is not None:
-            stated = {self.systematics.flat, None}
+        if self.origin == "given" and self.pattern is not None:
+            stated = {self.pattern.flat, None}
             if len(stated) > 1:
                 return next((each for each in self.science if flat_of(each) not in stated), None)
         return None
@@ -231,27 +231,27 @@ class PatternChoice:
         if not lacks_pattern(fit):
             return False
         if self.origin == "given":
-            assert self.systematics is not None
+            assert self.pattern is not None
             own = sorted({flat_of(each) or "not stated" for each in self.science})
             raise IncompatibleSetupError(
-                f"systematics: {fit.frames[0].observation.name} shows less than half of the "
-                f"pattern {self.systematics.name!r}. Flat field of the frames: {', '.join(own)}; "
-                f"of the pattern: {self.systematics.flat or 'not stated'}. Give a pattern of "
+                f"pattern: {fit.frames[0].observation.name} shows less than half of the "
+                f"pattern {self.pattern.name!r}. Flat field of the frames: {', '.join(own)}; "
+                f"of the pattern: {self.pattern.flat or 'not stated'}. Give a pattern of "
                 "frames that were calibrated alike, or 'auto'"
             )
         return self.origin == "library"
 
 
-def as_request(systematics: object) -> PatternRequest:
+def as_request(request: object) -> PatternRequest:
     """Make a request for a pattern; paths lead to files, or to a folder of libraries.
 
     Raises IncompatibleSetupError for anything else, CorruptFileError for a file without a pattern.
     """
-    match systematics:
-        case "auto" | "references" | "off" | Systematics() | PatternLibrary():
-            return systematics
+    match request:
+        case "auto" | "references" | "off" | DetectorPattern() | PatternLibrary():
+            return request
         case str() | os.PathLike():
-            path = Path(systematics)
+            path = Path(request)
             if path.is_dir():
                 return PatternLibrary.read(path)
             if path.is_file():
@@ -260,108 +260,108 @@ def as_request(systematics: object) -> PatternRequest:
                     what = product_in(hdus) or "no product of pyklip_diffrender"
                     if not is_library and ("INITIAL_OPD" in hdus or "PATTERN" not in hdus):
                         raise CorruptFileError(
-                            f"{path.name}: this is {what}, expected a flat-field pattern, such as "
-                            "a systematics.fits, or a library of them"
+                            f"{path.name}: this is {what}, expected a detector pattern, such as "
+                            "a pattern.fits, or a library of them"
                         )
-                return PatternLibrary.read(path) if is_library else Systematics.read(path)
+                return PatternLibrary.read(path) if is_library else DetectorPattern.read(path)
     raise IncompatibleSetupError(
-        f"systematics: got {systematics!r}, expected 'auto', 'references', 'off', a Systematics, a "
-        "PatternLibrary, or an existing file or folder with patterns, such as a systematics.fits"
+        f"pattern: got {request!r}, expected 'auto', 'references', 'off', a DetectorPattern, a "
+        "PatternLibrary, or an existing file or folder with patterns, such as a pattern.fits"
     )
 
 
-def choose_systematics(
+def choose_pattern(
     science: Sequence[Observation],
     references: ReferenceFrames,
     model: OpticalSystem,
     opd: OPDMap,
     *,
-    systematics: PatternRequest = "auto",
+    pattern: PatternRequest = "auto",
     library: bool = True,
-    settings: GaussNewton | None = None,
+    settings: FitSettings | None = None,
     memory: float | None = None,
     progress: bool = False,
-    map_for: Callable[[Time | None], OPDMap] | None = None,
+    opd_at: Callable[[Time | None], OPDMap] | None = None,
 ) -> PatternChoice:
-    """Choose the flat-field pattern for `science`, the frames of a target as they will be fitted.
+    """Choose the detector pattern for `science`, the frames of a target as they will be fitted.
 
     "auto", or a `PatternLibrary` to search besides the package's, fits `references`, frames of
     other stars or a function that returns them, only where no library has a pattern; "references"
-    fits them in any case and uses both. Fits of references start from `map_for` their date, by
+    fits them in any case and uses both. Fits of references start from `opd_at` their date, by
     default from `opd`. `library` is False for frames that do not show the library's pattern.
     Raises DiffrenderError if frames that have to be moved cannot be fitted; a reference star that
     cannot be fitted is left out.
     """
-    systematics = as_request(systematics)
+    request = as_request(pattern)
     common: dict[str, Any] = {
         "settings": _limited(settings, science[0], memory),
         "progress": progress,
     }
     fits: list[Refinement] = []
     failed: list[tuple[str, str]] = []
-    pattern = systematics if isinstance(systematics, Systematics) else None
-    origin: Origin = "none" if pattern is None else "given"
+    chosen = request if isinstance(request, DetectorPattern) else None
+    origin: Origin = "none" if chosen is None else "given"
     known = PatternLibrary()
-    if systematics == "off":
+    if request == "off":
         origin = "off"
-    if pattern is not None and pattern.first_pixel is not None and pattern.pattern.any():
-        name = pattern.name
-        science, pattern = _registered(science, pattern, model, opd, common)
-        if pattern is None:
+    if chosen is not None and chosen.first_pixel is not None and chosen.value.any():
+        name = chosen.name
+        science, chosen = _registered(science, chosen, model, opd, common)
+        if chosen is None:
             raise IncompatibleSetupError(
-                f"systematics: the pattern {name!r} is not seen in these frames, whose "
+                f"pattern {name!r} is not seen in these frames, whose "
                 "files do not say which pixels of the detector they show. Give 'auto'"
             )
-    if systematics != "off" and not isinstance(systematics, Systematics):
+    if request != "off" and not isinstance(request, DetectorPattern):
         first = science[0]
-        known = _library(systematics) if library else PatternLibrary()
+        known = _library(request) if library else PatternLibrary()
         # In this order: the library's pattern; the reference stars' pattern, whose fits take time;
         # and the rolls' pattern, whose size alone is known.
-        if systematics != "references" and library:
-            pattern = known_systematics(first, library=known)
-            if pattern is not None:
-                science, pattern = _registered(science, pattern, model, opd, common)
+        if request != "references" and library:
+            chosen = known_pattern(first, library=known)
+            if chosen is not None:
+                science, chosen = _registered(science, chosen, model, opd, common)
                 origin = "library"
-        if pattern is None and references:
+        if chosen is None and references:
             frames = references() if callable(references) else references
             frames, failed = _with_the_flat_of(first, frames)
-            fits, unfitted = _fit_references(frames, model, map_for or (lambda _: opd), common)
+            fits, unfitted = _fit_references(frames, model, opd_at or (lambda _: opd), common)
             failed += unfitted
-            pattern = known_systematics(first, fits, library=known)
+            chosen = known_pattern(first, fits, library=known)
             origin = "references"
-        if pattern is None:
-            pattern = _unknown_pattern(science)
+        if chosen is None:
+            chosen = _unknown_pattern(science)
             origin = "rolls"
-        if pattern is None:
+        if chosen is None:
             origin = "none"
-        _log.info("flat-field pattern: %s", pattern)
-    if pattern is not None and settings is None and science[0].is_nircam:
+        _log.info("detector pattern: %s", chosen)
+    if chosen is not None and settings is None and science[0].is_nircam:
         settings = replace(settings_for(science[0]), min_model_error=_KNOWN_MODEL_ERROR)
     settings = _limited(settings, science[0], memory)
     return PatternChoice(
-        tuple(science), pattern, settings, tuple(fits), tuple(failed), origin, known
+        tuple(science), chosen, settings, tuple(fits), tuple(failed), origin, known
     )
 
 
 def pattern_for_visit(
     choice: PatternChoice, science: Sequence[Observation], references: Sequence[Observation]
-) -> Systematics | None:
+) -> DetectorPattern | None:
     """The pattern for a fit of all frames of a visit, after the `choice` for the target's fit."""
     # A pattern that was learned from one of the fitted stars would count its frames twice: the
     # pattern of other stars is taken, or else a pattern of unknown values that frames of the same
     # pixels share.
-    given = choice.systematics if choice.origin == "given" else None
+    given = choice.pattern if choice.origin == "given" else None
     if choice.origin == "off" or (
         given is not None and not any(shows_star(given, each) for each in references)
     ):
-        return choice.systematics
+        return choice.pattern
     if is_known_beside(choice, references):
         patterns = [
             pattern
             for pattern in choice.library.patterns
             if not any(shows_star(pattern, each) for each in references)
         ]
-        known = known_systematics(
+        known = known_pattern(
             science[0], _fits_beside(choice, references), library=PatternLibrary(tuple(patterns))
         )
         if known is not None:
@@ -387,44 +387,44 @@ def _fits_beside(choice: PatternChoice, references: Sequence[Observation]) -> li
     ]
 
 
-def with_known_pattern(settings: GaussNewton) -> GaussNewton:
-    """Settings of a fit whose flat-field pattern accounts for the largest part of its error."""
+def with_known_pattern(settings: FitSettings) -> FitSettings:
+    """Settings of a fit whose detector pattern accounts for the largest part of its error."""
     return replace(settings, min_model_error=min(settings.min_model_error, _KNOWN_MODEL_ERROR))
 
 
-def _library(systematics: PatternLibrary | str) -> PatternLibrary:
+def _library(request: PatternLibrary | str) -> PatternLibrary:
     """The package's library, preceded by a library in the request."""
-    if isinstance(systematics, PatternLibrary):
-        return combine_libraries([systematics, package_library()])
+    if isinstance(request, PatternLibrary):
+        return combine_libraries([request, package_library()])
     return package_library()
 
 
 def _limited(
-    settings: GaussNewton | None, observation: Observation, memory: float | None
-) -> GaussNewton | None:
+    settings: FitSettings | None, observation: Observation, memory: float | None
+) -> FitSettings | None:
     """Settings with a limit of the memory, if there is one."""
     if memory is None:
         return settings
     return replace(settings or settings_for(observation), memory=memory)
 
 
-def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
+def _unknown_pattern(science: Sequence[Observation]) -> DetectorPattern | None:
     """Return a pattern whose size alone is known, if rolls tell it from a planet."""
     first = science[0]
     same = all(_alike(each, first) for each in science)
     # Files of one roll, such as the segments of an exposure, show a planet on the same pixels.
     # Frames of another star do not show it at all.
-    turned = any(abs(each.roll_from(first)) > _TURNED or each.reference for each in science)
+    turned = any(abs(each.roll_from(first)) > _OTHER_ROLL_DEG or each.reference for each in science)
     if not turned or not first.is_nircam or first.first_pixel is None or not same:
         return None
     zeros = np.zeros(first.shape)
     x, y = first.center[0]
-    return Systematics(
-        pattern=zeros,
-        error=zeros + _TYPICAL_PATTERN,
+    return DetectorPattern(
+        value=zeros,
+        error=zeros + _TYPICAL_PATTERN_RMS,
         center=(float(x), float(y)),
-        unknown=_TYPICAL_PATTERN,
-        pedestal=_TYPICAL_PEDESTAL if first.unit == u.MJy / u.sr else 0.0,
+        unknown=_TYPICAL_PATTERN_RMS,
+        pedestal=_TYPICAL_PEDESTAL_MJY_SR if first.unit == u.MJy / u.sr else 0.0,
         first_pixel=first.first_pixel,
         filter=first.filter,
         image_mask=image_mask(first.header, first.name),
@@ -461,7 +461,7 @@ def _alike(one: Observation, other: Observation) -> bool:
 def _fit_references(
     references: Sequence[Observation],
     model: OpticalSystem,
-    map_for: Callable[[Time | None], OPDMap],
+    opd_at: Callable[[Time | None], OPDMap],
     common: dict[str, Any],
 ) -> tuple[list[Refinement], list[tuple[str, str]]]:
     """Fit every reference star at each epoch; also the names of stars that fail, and why."""
@@ -473,7 +473,7 @@ def _fit_references(
             day = "" if date is None or len(epochs) == 1 else f" of {date.isot[:10]}"
             try:
                 with stage(f"reference star {star}{day}"):
-                    fits.append(refine(model, chosen, map_for(date), **common))
+                    fits.append(refine(model, chosen, opd_at(date), **common))
             except DiffrenderError as error:
                 _log.warning("reference star %s%s is left out: %s", star, day, error)
                 failed.append((star, str(error)))
@@ -482,11 +482,11 @@ def _fit_references(
 
 def _registered(
     science: Sequence[Observation],
-    pattern: Systematics,
+    pattern: DetectorPattern,
     model: OpticalSystem,
     opd: OPDMap,
     common: dict[str, Any],
-) -> tuple[Sequence[Observation], Systematics | None]:
+) -> tuple[Sequence[Observation], DetectorPattern | None]:
     """Move frames onto the pixels of the library's pattern; no pattern if this fails for one."""
     moved = []
     for each in science:
@@ -497,7 +497,7 @@ def _registered(
         if frame is None:
             _log.warning(
                 "%s: the file does not say which pixels of the detector its frames show, and the "
-                "known pattern of the flat field is not seen in them; it is not used", each.name
+                "known detector pattern is not seen in them; it is not used", each.name
             )  # fmt: skip
             return science, None
         moved.append(frame)
@@ -509,16 +509,14 @@ def _rough_fit(
     observation: Observation,
     opd: OPDMap,
     *,
-    settings: GaussNewton | None,
+    settings: FitSettings | None,
     progress: bool,
-    systematics: Systematics | None = None,
+    pattern: DetectorPattern | None = None,
 ) -> Refinement:
     """Fit until the pattern dominates the residual."""
     settings = settings or settings_for(observation)
-    settings = replace(settings, cycles=settings.cycles[:1], **_ROUGH)
-    return refine(
-        model, observation, opd, settings=settings, systematics=systematics, progress=progress
-    )
+    settings = replace(settings, cycles=settings.cycles[:1], **_ROUGH_SETTINGS)
+    return refine(model, observation, opd, settings=settings, pattern=pattern, progress=progress)
 
 
 def is_refuted_by_frame(
@@ -531,7 +529,7 @@ def is_refuted_by_frame(
         opd,
         settings=choice.settings,
         progress=False,
-        systematics=choice.systematics,
+        pattern=choice.pattern,
     )
     return rough.status.usable and choice.is_refuted_by(rough)
 
@@ -543,7 +541,7 @@ def _by_star(observations: Iterable[Observation]) -> dict[str, list[Observation]
     return stars
 
 
-# The fit of a target with the flat-field pattern that its frames turn out to have.
+# The fit of a target with the detector pattern that its frames turn out to have.
 
 
 def fit_with_pattern(
@@ -557,21 +555,21 @@ def fit_with_pattern(
     """Choose a pattern and fit the target; once more without the library if it is refuted.
 
     `fit` fits with a choice; its second argument is True without the library. `options` go to
-    `choose_systematics`. Returns the last fit and its choice. Raises what `choose_systematics`
+    `choose_pattern`. Returns the last fit and its choice. Raises what `choose_pattern`
     raises, and IncompatibleSetupError for a pattern that was given and is refuted.
     """
     # Only a fit can tell that frames which were calibrated with another flat field do not have the
     # known pattern. Where the headers make that likely, one of these frames is asked before all are
     # fitted: its rough fit takes a tenth of the time of two rolls'.
-    choice = choose_systematics(science, references, model, opd, **options)
+    choice = choose_pattern(science, references, model, opd, **options)
     frame = choice.of_other_flat_field
     if frame is not None:
-        with stage(f"flat-field pattern in {frame.name}"):
+        with stage(f"detector pattern in {frame.name}"):
             is_refuted = is_refuted_by_frame(choice, frame, model, opd)
         if is_refuted:
-            choice = choose_systematics(science, references, model, opd, library=False, **options)
+            choice = choose_pattern(science, references, model, opd, library=False, **options)
     result = fit(choice, False)
     if choice.is_refuted_by(result):
-        choice = choose_systematics(science, references, model, opd, library=False, **options)
+        choice = choose_pattern(science, references, model, opd, library=False, **options)
         result = fit(choice, True)
     return choice, result

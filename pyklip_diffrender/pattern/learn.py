@@ -1,4 +1,4 @@
-"""Learn a library of flat-field patterns from the frames of many stars, and test it on each."""
+"""Learn a library of detector patterns from the frames of many stars, and test it on each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.io.headers import same_name, unknown_name
 from pyklip_diffrender.io.progress import numbered_stages, stage
-from pyklip_diffrender.pattern.library import PatternLibrary, known_systematics
+from pyklip_diffrender.pattern.library import PatternLibrary, known_pattern
 from pyklip_diffrender.pattern.measure import (
     flat_of,
     measure_patterns,
@@ -36,15 +36,15 @@ from pyklip_diffrender.pattern.measure import (
 from pyklip_diffrender.refinement.fit_file import encoded
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import FitSettings, settings_for
 from pyklip_diffrender.scene.admission import admitted, exposures_in, frames_by_star
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 from pyklip_diffrender.scene.simulation import model_for
-from pyklip_diffrender.scene.systematics import Systematics
-from pyklip_diffrender.wavefront.opd import wavefront_for
+from pyklip_diffrender.wavefront.opd import opd_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 _log = logging.getLogger(__name__)
@@ -54,26 +54,26 @@ Files = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 _Fit = tuple[Refinement, tuple[float, float]]
 """A fit, and the size of its pattern in the frames with the error of the size."""
 
-_ALONE = 0.01
+_MODEL_ERROR_ALONE = 0.01
 """Smallest model error, as a fraction of the star, in the fit of a star without a pattern."""
 
-_KNOWN = 0.002
+_MODEL_ERROR_WITH_PATTERN = 0.002
 """Smallest model error with the pattern of other stars; the pattern's error is counted apart."""
 
 
-def learn_library(
+def learn_patterns(
     files: Files,
     opd: Any,
     *,
     stars: Sequence[str] = (),
     filters: Sequence[str] = (),
     size: int = 80,
-    settings: GaussNewton | None = None,
+    settings: FitSettings | None = None,
     folder: str | os.PathLike[str] | None = None,
     device: str = "cpu",
     progress: bool = False,
 ) -> PatternLibrary:
-    """Learn the flat-field pattern from the frames of many stars.
+    """Learn the detector pattern from the frames of many stars.
 
     Frames are sorted by star, epoch and set-up (detector, mask, filter, flat field). Every star is
     fitted twice: alone, and then with the pattern that the first fits of the other stars show, so
@@ -88,17 +88,17 @@ def learn_library(
     Parameters
     ----------
     files : path or sequence of path
-        Files as for `Sequence.from_files`, of any number of stars, epochs, filters and masks.
-        Frames are calibrated (MJy/sr), and say which pixels of the detector they have.
+        Files as for `ExposureSequence.from_files`, of any number of stars, epochs, filters and
+        masks. Frames are calibrated (MJy/sr), and say which pixels of the detector they have.
     opd : path, OPDMap, Quantity, array, "flat" or callable
-        The wavefront to start from, as for `reduce`; a function gets the `Sequence` of a star and
-        returns its `OPDMap`.
+        The wavefront to start from, as for `reduce`; a function gets the `ExposureSequence` of a
+        star and returns its `OPDMap`.
     stars, filters : sequence of str
         Names of the stars and filters to use; default all.
     size : int
         Side in pixels of the square about the star that is fitted, and for which the library has
         the pattern.
-    settings : GaussNewton, optional
+    settings : FitSettings, optional
         Fit settings; default as in `refine`. The model error is replaced.
     folder : path, optional
         Folder for finished fits. A run with the same frames, headers, map and settings takes the
@@ -128,16 +128,16 @@ def learn_library(
 
     Examples
     --------
-    With frames and wavefront maps in folders, which the package does not contain:
+    With frames and OPD maps in folders, which the package does not contain:
 
     >>> import pyklip_diffrender as dr
-    >>> library = dr.learn_library("calints", "maps", folder="fits")  # doctest: +SKIP
+    >>> library = dr.pattern.learn_patterns("calints", "maps", folder="fits")  # doctest: +SKIP
     >>> library.write("patterns.fits")  # doctest: +SKIP
     """
     epochs = list(_epochs(files, opd, stars, filters, size))
     if not epochs:
         raise NoValidPixelsError(
-            "no star is left to learn the flat-field pattern from; the log says why"
+            "no star is left to learn the detector pattern from; the log says why"
         )
     fitter = _Fitter(settings, None if folder is None else Path(folder), device, progress)
     parts = []
@@ -147,7 +147,7 @@ def learn_library(
     patterns = [pattern for part, _ in parts for pattern in part]
     if not patterns:
         raise RefinementError(
-            f"none of {len(epochs)} fits is good enough to learn the flat-field pattern from; the "
+            f"none of {len(epochs)} fits is good enough to learn the detector pattern from; the "
             "log says why"
         )
     rows = [row for _, part in parts for row in part]
@@ -182,19 +182,19 @@ class _Epoch:
 class _Fitter:
     """Fits that are kept in a folder."""
 
-    settings: GaussNewton | None
+    settings: FitSettings | None
     folder: Path | None
     device: str
     progress: bool
 
     def fit(
-        self, epoch: _Epoch, known: Systematics | None
+        self, epoch: _Epoch, known: DetectorPattern | None
     ) -> tuple[Refinement, tuple[float, float]]:
         """Fit an epoch, or read the fit; also how much of the pattern it shows."""
         first = epoch.science[0]
         settings = replace(
             self.settings or replace(settings_for(first), max_companions=0),
-            min_model_error=_ALONE if known is None else _KNOWN,
+            min_model_error=_MODEL_ERROR_ALONE if known is None else _MODEL_ERROR_WITH_PATTERN,
         )
         path = None
         if self.folder is not None:
@@ -215,7 +215,7 @@ class _Fitter:
                 model,
                 epoch.science,
                 epoch.opd,
-                systematics=known,
+                pattern=known,
                 settings=settings,
                 progress=self.progress,
             )
@@ -240,7 +240,7 @@ def _learn(epochs: Sequence[_Epoch], fitter: _Fitter) -> tuple[list[Any], list[d
         # In the second fit the wavefront imitates less of the pattern, which is measured again.
         others = [fit for other, fit in alone.items() if not same_name(other.star, epoch.star)]
         library = PatternLibrary(tuple(measure_patterns(others, pedestal)))
-        known = known_systematics(epoch.science[0], library=library)
+        known = known_pattern(epoch.science[0], library=library)
         again = None if known is None else _attempt(epoch, known, fitter)
         chi2, shown = np.nan, (np.nan, np.nan)
         if again is not None:
@@ -266,7 +266,7 @@ def _learn(epochs: Sequence[_Epoch], fitter: _Fitter) -> tuple[list[Any], list[d
     return measure_patterns(last, pattern_pedestal(last)), rows
 
 
-def _attempt(epoch: _Epoch, known: Systematics | None, fitter: _Fitter) -> _Fit | None:
+def _attempt(epoch: _Epoch, known: DetectorPattern | None, fitter: _Fitter) -> _Fit | None:
     """Fit an epoch; None, with a warning, if it fails."""
     try:
         fit = fitter.fit(epoch, known)
@@ -313,12 +313,12 @@ def _is_called(name: str, star: str, frames: Iterable[FrameFile]) -> bool:
 def _of_setup(star: str, files: Sequence[FrameFile], opd: Any, size: int) -> Iterable[_Epoch]:
     """Epochs of a star with one set-up; the log names the epochs that cannot be used."""
     try:
-        sequences = FrameSequence.by_epoch([each.path for each in files], target=star)
+        sequences = ExposureSequence.by_epoch([each.path for each in files], target=star)
     except DiffrenderError as error:
         _log.warning("%s is left out: %s", star, error)
         return
-    find: Callable[[FrameSequence], OPDMap] = (
-        opd if callable(opd) else lambda sequence: wavefront_for(opd, sequence.date)
+    find: Callable[[ExposureSequence], OPDMap] = (
+        opd if callable(opd) else lambda sequence: opd_for(opd, sequence.date)
     )
     used = {row.path for each in sequences for row in each.rows if row.use == "target"}
     for name, reason in sequences[0].excluded:
@@ -353,11 +353,11 @@ def _chi2(fit: Refinement) -> float:
 
 
 def _shown(fit: Refinement) -> tuple[float, float]:
-    size = None if fit.systematics is None else pattern_size(fit)
+    size = None if fit.pattern is None else pattern_size(fit)
     return (np.nan, np.nan) if size is None else size
 
 
-def _digest(epoch: _Epoch, settings: GaussNewton, known: Systematics | None) -> str:
+def _digest(epoch: _Epoch, settings: FitSettings, known: DetectorPattern | None) -> str:
     """Hash of everything that decides the result of a fit: all that frames, map and pattern say."""
     digest = hashlib.sha256(f"{__version__} {json.dumps(encoded(settings))}".encode())
     parts: list[Any] = [*epoch.science, replace(epoch.opd, path=None)]

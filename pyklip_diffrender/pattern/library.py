@@ -1,4 +1,4 @@
-"""Libraries of flat-field patterns that were measured on stars: files, search and combination.
+"""Libraries of detector patterns that were measured on stars: files, search and combination.
 
 The package's own library was measured on frames of JWST programme 1184.
 """
@@ -36,19 +36,19 @@ from pyklip_diffrender.pattern.measure import (
     measure_patterns,
 )
 from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.scene.exposure import star_of
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import (
+from pyklip_diffrender.scene.detector_pattern import (
     HALF_COVERED,
-    Systematics,
+    DetectorPattern,
     contradiction,
     pattern_fields,
     pattern_hdus,
     shows_star,
     unrecorded,
 )
+from pyklip_diffrender.scene.exposure import star_of
+from pyklip_diffrender.scene.observation import Observation
 
-_SETUP = {"filter", "mask", "detector"}
+_STATED_SETUP = {"filter", "mask", "detector"}
 """Properties that both a pattern of a library and the frames that it is for must state."""
 
 _VERSION = 2
@@ -57,14 +57,14 @@ _VERSION = 2
 
 @dataclass(frozen=True, eq=False)
 class PatternLibrary:
-    """Flat-field patterns of many stars, set-ups and dates.
+    """Detector patterns of many stars, set-ups and dates.
 
     Attributes
     ----------
     patterns : tuple of MeasuredPattern
         Measured patterns, one for each frame.
     validation : QTable
-        Table with a row for each star and epoch, see `learn_library`; empty for patterns that were
+        Table with a row for each star and epoch, see `learn_patterns`; empty for patterns that were
         not tested on each other.
 
     Examples
@@ -73,7 +73,7 @@ class PatternLibrary:
 
     >>> import pyklip_diffrender as dr
     >>> library = dr.PatternLibrary.read("patterns")  # doctest: +SKIP
-    >>> result = dr.reduce("calints", "maps", systematics=library)  # doctest: +SKIP
+    >>> result = dr.reduce("calints", "maps", pattern=library)  # doctest: +SKIP
     """
 
     patterns: tuple[MeasuredPattern, ...] = ()
@@ -99,7 +99,7 @@ class PatternLibrary:
             pattern
             for pattern in self.patterns
             if contradiction(pattern, observation) is None
-            and _SETUP.isdisjoint(unrecorded(pattern, observation))
+            and _STATED_SETUP.isdisjoint(unrecorded(pattern, observation))
             and not shows_star(pattern, observation)
             and _covered(pattern, observation) >= HALF_COVERED
         ]
@@ -133,8 +133,8 @@ class PatternLibrary:
         """Write to a FITS file, atomically.
 
         Each pattern has the extensions PATTERN and PATTERN_ERROR (NaN where nothing was measured),
-        as a `Systematics`, with the star, file, date, detector and flat field in the header, and
-        STAR (the star without the pattern, MJy/sr), if it was kept. EXTVER is the number of the
+        as a `DetectorPattern`, with the star, file, date, detector and flat field in the header,
+        and STAR (the star without the pattern, MJy/sr), if it was kept. EXTVER is the number of the
         pattern, from 1; VALIDATION is a table, and PATVERS in the primary header the version of the
         layout.
 
@@ -175,7 +175,7 @@ def combine_libraries(libraries: Iterable[PatternLibrary]) -> PatternLibrary:
     --------
     >>> import pyklip_diffrender as dr
     >>> from pyklip_diffrender.pattern import package_library
-    >>> print(dr.combine_libraries([dr.PatternLibrary(), package_library()]))
+    >>> print(dr.pattern.combine_libraries([dr.PatternLibrary(), package_library()]))
     <PatternLibrary: 8 frames of HIP17695, G-7-34>
     """
     several = list(libraries)
@@ -188,13 +188,13 @@ def combine_libraries(libraries: Iterable[PatternLibrary]) -> PatternLibrary:
     return PatternLibrary(tuple(patterns.values()), validation)
 
 
-def known_systematics(
+def known_pattern(
     observation: Observation,
     references: Refinement | Sequence[Refinement] = (),
     *,
     library: bool | PatternLibrary = True,
-) -> Systematics | None:
-    """Combine the flat-field patterns of reference stars and of a library.
+) -> DetectorPattern | None:
+    """Combine the detector patterns of reference stars and of a library.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def known_systematics(
 
     Returns
     -------
-    Systematics or None
+    DetectorPattern or None
         The pattern; None if there are fewer than two frames to learn from.
 
     Examples
@@ -220,8 +220,8 @@ def known_systematics(
     >>> frame = dr.Observation.from_arrays(
     ...     ones, ones, pixelscale=0.063, filter="F444W", header=header
     ... )
-    >>> print(dr.known_systematics(frame))
-    <Systematics 'HIP17695, G-7-34': F444W, 80 x 80 pixels>
+    >>> print(dr.known_pattern(frame))
+    <DetectorPattern 'HIP17695, G-7-34': F444W, 80 x 80 pixels>
     """
     if isinstance(library, bool):
         library = package_library() if library else PatternLibrary()
@@ -325,7 +325,7 @@ def _read(path: Path) -> tuple[tuple[MeasuredPattern, ...], QTable]:
 
 def _pattern(hdus: fits.HDUList, number: int) -> MeasuredPattern:
     header, fields = hdus["PATTERN", number].header, pattern_fields(hdus, number)
-    value, error = fields.pop("pattern"), fields.pop("error")
+    value, error = fields.pop("value"), fields.pop("error")
     known = np.isfinite(error)
     has_star = ("STAR", number) in hdus
     return MeasuredPattern(

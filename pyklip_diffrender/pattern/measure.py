@@ -1,4 +1,4 @@
-"""Learn the flat-field pattern from stars other than the target."""
+"""Learn the detector pattern from stars other than the target."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from scipy.optimize import minimize_scalar
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement.fit_result import FrameFit, Refinement
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.exposure import (
     CatalogueStar,
     detector_of,
@@ -24,13 +25,12 @@ from pyklip_diffrender.scene.exposure import (
     star_of,
 )
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
 
 # The pedestal of a pattern: light besides the star that the pattern multiplies.
 
 Image = NDArray[np.float64]
 
-_RING = 4.0
+_RING_WIDTH_PIXELS = 4.0
 """Width in pixels of the rings in which scatters are estimated."""
 
 _FIRST_RING = 2
@@ -40,13 +40,13 @@ as well."""
 FEW_PIXELS = 50
 """Number of pixels below which no scatter is estimated in a ring."""
 
-_RING_TO_RING = 0.2
+_RING_TO_RING_ERROR = 0.2
 """Relative error of a ring's mean product, because the pattern is not the same in all rings."""
 
-_DIFFERENT = 1.5
+_OTHER_BRIGHTNESS_RATIO = 1.5
 """Ratio of the brightness of two stars from which their residuals tell the pedestal."""
 
-_ROBUST = 2.0
+_HALF_WEIGHT_SIGMAS = 2.0
 """Deviation, in standard deviations, of half weight."""
 
 OUTLIER = 4.0
@@ -99,7 +99,7 @@ def _pairs_of_stars(fits: Sequence[Refinement]) -> Iterator[_Pair]:
             continue
         first, second = light_and_residual(a), light_and_residual(b)
         fainter, brighter = sorted((first[0].sum(), second[0].sum()))
-        if brighter < _DIFFERENT * fainter:
+        if brighter < _OTHER_BRIGHTNESS_RATIO * fainter:
             continue
         valid = first[3] & second[3]
         light, left, noise = (
@@ -120,7 +120,7 @@ def _pedestal_between_stars(pairs: Sequence[_Pair]) -> float:
             deviation = (left[0] * other[0] - left[1] * other[1]) ** 2
             ratio = deviation / ((noise * other) ** 2).sum(axis=0)
             # Cauchy's loss, because of companions, outliers and errors of the wavefront.
-            total += float(np.log1p(ratio / _ROBUST**2).sum())
+            total += float(np.log1p(ratio / _HALF_WEIGHT_SIGMAS**2).sum())
         return total
 
     brightest = max(float(pair.light.max()) for pair in pairs)
@@ -153,7 +153,7 @@ def _products(fit: Refinement) -> list[tuple[float, float, float, float]]:
             scatter = float(np.sqrt((noise**2).mean() * (noise_b**2).mean() / len(products)))
             rings.append(
                 (mean, float(light[inside].mean()), float(light_b[inside].mean()),
-                 float(np.hypot(scatter, _RING_TO_RING * mean)))
+                 float(np.hypot(scatter, _RING_TO_RING_ERROR * mean)))
             )  # fmt: skip
     return rings
 
@@ -178,7 +178,7 @@ def light_and_residual(frame: FrameFit) -> tuple[Image, Image, Image, NDArray[np
 def widths_from_star(shape: tuple[int, int], center: tuple[float, float]) -> Image:
     """Distance of every pixel from the star, in widths of a ring."""
     y, x = np.indices(shape)
-    return np.asarray(np.hypot(x - center[0], y - center[1]) / _RING)
+    return np.asarray(np.hypot(x - center[0], y - center[1]) / _RING_WIDTH_PIXELS)
 
 
 def rings_about(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.int64]:
@@ -186,24 +186,24 @@ def rings_about(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[
     return widths_from_star(shape, center).astype(np.int64)
 
 
-# How much of a known pattern of the flat field's errors the frames of a fit show.
+# How much of a known detector pattern the frames of a fit show.
 #
 # A library of patterns is valid for frames that were calibrated with the same flat field. With
 # another one, which may be better, the frames show less of the pattern, or none of it.
 
 _log = logging.getLogger(__name__)
 
-_HALF = 0.5
+_LACKING_PATTERN_SIZE = 0.5
 """Size below which more of the pattern would remain with it than without it."""
 
-_SURE = 2.0
-"""Standard deviations by which the size must be below `_HALF`."""
+_LACKING_PATTERN_SIGMAS = 2.0
+"""Standard deviations by which the size must be below `_LACKING_PATTERN_SIZE`."""
 
 
 def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     """Measure the size of the known pattern in the frames, and the error of the size.
 
-    The size is 1 if the frames show what ``Systematics.pattern`` says, and 0 if they show nothing
+    The size is 1 if the frames show what ``DetectorPattern.value`` says, and 0 if they show nothing
     of it. All unknowns of the fit are marginalised, as well as the error of the pattern.
 
     Parameters
@@ -225,19 +225,19 @@ def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     >>> import pyklip_diffrender as dr
     >>> from pyklip_diffrender.pattern import pattern_size
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> frames = dr.simulate(model, dr.Scene(), opd, seed=3)
     >>> pattern = 0.04 * np.random.default_rng(1).normal(size=(32, 32))
     >>> frames = replace(frames, data=frames.data * (1 + pattern / 4))
     >>> error = np.full_like(pattern, 0.01)
-    >>> known = dr.Systematics(pattern, error, frames.center[0], unknown=0.04)
-    >>> settings = dr.GaussNewton(cycles=6)
-    >>> fit = dr.refine(model, frames, opd, settings=settings, systematics=known)
+    >>> known = dr.DetectorPattern(pattern, error, frames.center[0], unknown=0.04)
+    >>> settings = dr.FitSettings(cycles=6)
+    >>> fit = dr.refine(model, frames, opd, settings=settings, pattern=known)
     >>> size, error = pattern_size(fit)
     >>> print(f"{size:.2f} +- {error:.2f}")
     0.25 +- 0.02
     """
-    if fit.systematics is None:
+    if fit.pattern is None:
         return None
     # The residual of a fit with the pattern m is (size - 1) m (s + B): it is fitted as a template,
     # marginalised over the unknowns.
@@ -259,23 +259,23 @@ def lacks_pattern(fit: Refinement) -> bool:
         return False
     size, error = measured
     _log.info("the frames show %.2f +- %.2f of the pattern", size, error)
-    lacks = size + _SURE * error < _HALF
+    lacks = size + _LACKING_PATTERN_SIGMAS * error < _LACKING_PATTERN_SIZE
     if lacks:
-        assert fit.systematics is not None
+        assert fit.pattern is not None
         _log.warning(
-            "%s: the frames show %.2f +- %.2f of the flat-field pattern of %s. They were probably "
+            "%s: the frames show %.2f +- %.2f of the detector pattern of %s. They were probably "
             "calibrated with another flat field",
-            fit.frames[0].observation.name, size, error, fit.systematics.name,
+            fit.frames[0].observation.name, size, error, fit.pattern.name,
         )  # fmt: skip
     return lacks
 
 
-_ASPECTS = {
+_SHARED_PROPERTIES = {
     "filter": "filter", "image_mask": "mask", "detector": "detector", "flat": "flat field (R_FLAT)",
 }  # fmt: skip
 """Properties that averaged patterns share, by the names of their attributes."""
 
-_SMOOTH = 1.0
+_SMOOTH_RINGS = 1.0
 """Rings (standard deviation) over which the scatter between frames is averaged."""
 
 
@@ -297,7 +297,7 @@ class MeasuredPattern:
     # Where and when the pattern was measured.
     frame: str = ""
     date: str = ""
-    # The pedestal as in `Systematics`, in the unit of the frame.
+    # The pedestal as in `DetectorPattern`, in the unit of the frame.
     pedestal: float = 0.0
     # The detector as headers name it, such as NRCALONG.
     detector: str | None = None
@@ -346,9 +346,9 @@ class MeasuredPattern:
         )
 
 
-def learn_systematics(
+def learn_pattern(
     fits: Refinement | Sequence[Refinement], *, name: str | None = None
-) -> Systematics:
+) -> DetectorPattern:
     """Learn the pattern that the star model misses from fits of other stars.
 
     In every frame the residual is divided by the sum of the star and a pedestal, the same in all
@@ -369,7 +369,7 @@ def learn_systematics(
 
     Returns
     -------
-    Systematics
+    DetectorPattern
 
     Raises
     ------
@@ -380,16 +380,16 @@ def learn_systematics(
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> frames = [dr.simulate(model, dr.Scene(), opd, seed=k) for k in (1, 2)]
-    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6))
-    >>> dr.learn_systematics(fit, name="noise")
-    <Systematics 'noise': F444W, 32 x 32 pixels>
+    >>> fit = dr.refine(model, frames, opd, settings=dr.FitSettings(cycles=6))
+    >>> dr.learn_pattern(fit, name="noise")
+    <DetectorPattern 'noise': F444W, 32 x 32 pixels>
     """
     patterns = measure_patterns(fits)
     if len(patterns) < 2:
         raise IncompatibleSetupError(
-            f"learn_systematics: got {len(patterns)} usable frames, expected at least two, such "
+            f"learn_pattern: got {len(patterns)} usable frames, expected at least two, such "
             "as two rolls of a reference star"
         )
     return combine_patterns(patterns, name)
@@ -400,7 +400,7 @@ def measure_patterns(
 ) -> list[MeasuredPattern]:
     """Measure the pattern in every frame of the fits that did not fail.
 
-    The pedestal, as in `Systematics` and in the unit of the frames, is estimated by default.
+    The pedestal, as in `DetectorPattern` and in the unit of the frames, is estimated by default.
     """
     several = [fits] if isinstance(fits, Refinement) else list(fits)
     usable = [fit for fit in several if fit.status.usable]
@@ -409,8 +409,10 @@ def measure_patterns(
     return [_measured(frame, pedestal) for fit in usable for frame in fit.frames]
 
 
-def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = None) -> Systematics:
-    """Average measured patterns, see `learn_systematics`, with one pedestal (`common_pedestal`).
+def combine_patterns(
+    patterns: Sequence[MeasuredPattern], name: str | None = None
+) -> DetectorPattern:
+    """Average measured patterns, see `learn_pattern`, with one pedestal (`common_pedestal`).
 
     Raises IncompatibleSetupError for patterns of several filters, masks, detectors or flat fields,
     or of none, and if patterns whose stars were not kept have different pedestals.
@@ -420,8 +422,8 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
         stated = {getattr(pattern, aspect) for pattern in patterns}
         if len(stated - {None}) > 1 or not stated:
             raise IncompatibleSetupError(
-                f"systematics: got patterns of {sorted(map(str, stated))}, expected one "
-                f"{_ASPECTS[aspect]}"
+                f"pattern: got patterns of {sorted(map(str, stated))}, expected one "
+                f"{_SHARED_PROPERTIES[aspect]}"
             )
         # What some patterns do not state is not known of all.
         setup[aspect] = stated.pop() if len(stated) == 1 else None
@@ -440,11 +442,11 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
     # error of the mean.
     precision = (1 / (variances + scatter**2)).sum(axis=0)
     total = precision + width**-2.0
-    pattern = (values / (variances + scatter**2)).sum(axis=0) / total
+    value = (values / (variances + scatter**2)).sum(axis=0) / total
     error = np.sqrt(1 / total + np.where(precision > 0, scatter**2, 0.0))
     names = list(dict.fromkeys(stars))
-    return Systematics(
-        pattern=pattern,
+    return DetectorPattern(
+        value=value,
         error=np.minimum(error, width),
         center=center,
         first_pixel=first_pixel,
@@ -563,7 +565,9 @@ def _scatter_between_frames(
             share = 1 / np.median(noise[inside]) ** 2
             excess[k] += share * (spread - np.median(noise[inside]))
             weight[k] += share
-    excess, weight = (gaussian_filter1d(each, _SMOOTH, mode="nearest") for each in (excess, weight))
+    excess, weight = (
+        gaussian_filter1d(each, _SMOOTH_RINGS, mode="nearest") for each in (excess, weight)
+    )
     return _on_pixels(np.divide(excess, 2 * weight, where=weight > 0, out=np.zeros(count)), away)
 
 

@@ -1,4 +1,4 @@
-"""The settings of a reduction and the wavefront map it starts from.
+"""The settings of a reduction and the OPD map it starts from.
 
 `klip_dataset` accepts no further keywords, so the settings of the backend come from three places.
 A field given in an earlier one overrides the same field in a later one:
@@ -15,7 +15,7 @@ import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -25,16 +25,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
 from pyklip_diffrender.options import OPTIONS, Accuracy, ReduceOptions
-from pyklip_diffrender.wavefront.opd import wavefront_for
+from pyklip_diffrender.wavefront.opd import opd_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.pattern import PatternLibrary
-    from pyklip_diffrender.refinement import GaussNewton
-    from pyklip_diffrender.scene.systematics import Systematics
+    from pyklip_diffrender.refinement import FitSettings
+    from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
-"""A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
+"""An OPD map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
 
 IMAGES = ("cleaned", "subtracted")
 """Images that the products can carry."""
@@ -50,9 +50,9 @@ class DiffrenderSettings:
     Attributes
     ----------
     opd : path, ndarray, Quantity or OPDMap, optional
-        Wavefront map to start from: a FITS file, or a square array in metres, OTE entrance-pupil
+        OPD map to start from: a FITS file, or a square array in metres, OTE entrance-pupil
         orientation. There is no default: a reduction without one raises `MissingOPDError`. Of a
-        folder of maps, the one closest in time to the frames is taken; see `choose_map` for other
+        folder of maps, the one closest in time to the frames is taken; see `choose_opd` for other
         rules. "flat" stands for a flat wavefront.
     model : optical model or mapping, optional
         Model from `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
@@ -61,7 +61,7 @@ class DiffrenderSettings:
         NIRCam filter, such as ``"F444W"``. Read from the dataset if possible.
     pixelscale : float or (x, y), optional
         Arcsec per pixel. Read from the dataset if possible.
-    fit_pixels : int, optional
+    size : int, optional
         Side in pixels of the fitted square about the star; the subtraction covers the whole
         frame. By default as large as the frames allow, up to 80, or up to 56 for a first look with
         ``accuracy="quick"``.
@@ -71,10 +71,8 @@ class DiffrenderSettings:
         one, else estimated from the frames.
     unit : Unit, optional
         Unit of the frames. Read from BUNIT if present, else dimensionless.
-    fit : GaussNewton, optional
-        Settings of the fit; see `refine`.
-    systematics : Systematics, PatternLibrary, path, "auto", "references" or "off", optional
-        Flat-field pattern. "auto", the default for real NIRCam frames, takes the pattern of the
+    pattern : DetectorPattern, PatternLibrary, path, "auto", "references" or "off", optional
+        Detector pattern. "auto", the default for real NIRCam frames, takes the pattern of the
         package's library, and fits the reference frames only where it has none; "references" fits
         them in any case and uses both; a library, its file, or a folder of such files is searched
         besides the package's; see `reduce`. Reference frames come from a psf_library that
@@ -115,7 +113,7 @@ class DiffrenderSettings:
     Examples
     --------
     >>> import pyklip_diffrender as dr
-    >>> settings = dr.DiffrenderSettings(opd="opd.fits", fit_pixels=80)
+    >>> settings = dr.pyklip_backend.DiffrenderSettings(opd="opd.fits", size=80)
 
     For one `dataset` that pyKLIP has read:
 
@@ -126,12 +124,12 @@ class DiffrenderSettings:
     model: Any = None
     filter: str | None = None
     pixelscale: float | tuple[float, float] | None = None
-    fit_pixels: int | None = None
+    size: int | None = None
     error: ArrayLike | None = None
     unit: u.UnitBase | None = None
-    fit: GaussNewton | None = None
+    settings: FitSettings | None = None
     start: Mapping[str, Any] | None = None
-    systematics: Systematics | PatternLibrary | str | os.PathLike[str] | None = None
+    pattern: DetectorPattern | PatternLibrary | str | os.PathLike[str] | None = None
     references: str | None = None
     keep_detected: bool | None = None
     threshold: float | None = None
@@ -148,14 +146,12 @@ class DiffrenderSettings:
 
     def __post_init__(self) -> None:
         from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-        from pyklip_diffrender.refinement import GaussNewton
+        from pyklip_diffrender.refinement import FitSettings
 
         options = ReduceOptions(**self.given)
-        if self.systematics is not None:
+        if self.pattern is not None:
             # What is read from files is kept: settings are merged for every call.
-            object.__setattr__(self, "systematics", options.systematics)
-        if self.fit_pixels is not None:
-            replace(OPTIONS["size"], name="fit_pixels").checked(self.fit_pixels)
+            object.__setattr__(self, "pattern", options.pattern)
         choices = (
             ("image", self.image, IMAGES),
             ("keep_detected", self.keep_detected, (True, False)),
@@ -169,7 +165,7 @@ class DiffrenderSettings:
         if threads is not None and not (isinstance(threads, int) and threads >= 1):
             raise IncompatibleSetupError(f"threads: got {threads!r}, expected 1 or more")
         for name, value, kind in (
-            ("fit", self.fit, GaussNewton),
+            ("settings", self.settings, FitSettings),
             ("start", self.start, Mapping),
             ("model_options", self.model_options, Mapping),
         ):
@@ -178,11 +174,6 @@ class DiffrenderSettings:
                     f"{name}: got a {type(value).__name__}, expected a "
                     f"{'dict' if kind is Mapping else kind.__name__}"
                 )
-        if self.fit is not None and self.accuracy == "quick":
-            raise IncompatibleSetupError(
-                "accuracy, fit: got 'quick' and settings of the fit, expected one of them: a first "
-                "look chooses its own settings"
-            )
         known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
         wrong = sorted(set(self.model_options) - known)
         # Another subtractor may make another model.
@@ -217,6 +208,7 @@ DiffrenderSettings.__doc__ = inspect.cleandoc(DiffrenderSettings.__doc__ or "").
     "\n".join(
         OPTIONS[name].entry
         for name in (
+            "settings",
             "start",
             "references",
             "threshold",
@@ -266,7 +258,7 @@ def thread_limit(count: int | None) -> Iterator[None]:
 
 
 def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
-    """Read the wavefront map that the settings name, or choose it by the date of the frames.
+    """Read the OPD map that the settings name, or choose it by the date of the frames.
 
     Raises
     ------
@@ -284,11 +276,11 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
     """
     if settings.opd is None:
         raise MissingOPDError(
-            "algo='diffrender' starts from a measured wavefront map and none was given. Give a "
+            "algo='diffrender' starts from a measured OPD map and none was given. Give a "
             "FITS file, an array in metres or a Quantity, in one of three ways: "
             "register(opd=...) once; `with backend(opd=...):` around klip_dataset; or "
             "dataset.diffrender = DiffrenderSettings(opd=...). For JWST, take the map measured "
             "closest in time to the observation, or give the folder with your maps; opd='flat' "
             "starts without one"
         )
-    return wavefront_for(settings.opd, date)
+    return opd_for(settings.opd, date)

@@ -1,14 +1,14 @@
 """The frames of one wavelength of a pyKLIP dataset that a fit gets, by pointing.
 
-Their files are judged as `Sequence` judges files. The fit gets the pixels that the files recorded,
-or the pixels of ``dataset.input``.
+Their files are judged as `ExposureSequence` judges files. The fit gets the pixels that the files
+recorded, or the pixels of ``dataset.input``.
 """
 
 from __future__ import annotations
 
 import logging
 import warnings
-from collections import abc
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,12 +46,13 @@ from pyklip_diffrender.scene.exposure import beginning, is_reference, star_of
 from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.integrations import checked_stacks, compressed, mask_unusable
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 
 _log = logging.getLogger(__name__)
 
 
-# Files of a dataset and of its library of reference stars, judged as `Sequence` judges files.
+# Files of a dataset and of its library of reference stars, judged as `ExposureSequence` judges
+# files.
 
 
 class Admitted(NamedTuple):
@@ -72,12 +73,12 @@ def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
     return tuple(path for path in paths if path.name in names)
 
 
-def admit(source: SourceFrames, frames: NDArray[np.intp], library: abc.Sequence[Path]) -> Admitted:
+def admit(source: SourceFrames, frames: NDArray[np.intp], library: Sequence[Path]) -> Admitted:
     """Judge the files of `frames`, indices in `source`, of one filter, and of the library.
 
     The target is the star of the first frame that is not marked as a reference (IS_PSF). Raises as
-    `pyklip_diffrender.Sequence.from_files`, and warns of every file that is not used, or not
-    entirely.
+    `pyklip_diffrender.ExposureSequence.from_files`, and warns of every file that is not used, or
+    not entirely.
     """
     paths = [source.paths[k] for k in frames]
     sequence = source.sequence
@@ -117,14 +118,14 @@ def admit(source: SourceFrames, frames: NDArray[np.intp], library: abc.Sequence[
 def _sequence(
     source: SourceFrames,
     frames: NDArray[np.intp],
-    paths: abc.Sequence[Path],
-    library: abc.Sequence[Path],
-) -> Sequence:
+    paths: Sequence[Path],
+    library: Sequence[Path],
+) -> ExposureSequence:
     """Sort the files of frames and of the library, opening none twice."""
     headers = [source.headers[k] for k in frames]
     first = next((k for k, h in enumerate(headers) if not is_reference(h)), 0)
     name = source.filenames[frames[first]]
-    return Sequence.of_opened(
+    return ExposureSequence.of_opened(
         [source.files[path] for path in dict.fromkeys(paths)],
         [FrameFile.opened(path, lambda exposure: True) for path in library],
         target=next(iter(star_of(headers[first], name).names), None),
@@ -196,8 +197,8 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
     >>> import pyklip_diffrender as dr
     >>> images = np.random.default_rng(1).normal(size=(2, 16, 16))
     >>> dataset = GenericData(images, np.full((2, 2), 7.5), filenames=["roll 1", "roll 2"])
-    >>> dataset.diffrender = dr.DiffrenderSettings(pixelscale=0.063)
-    >>> observation = dr.observation_from_dataset(dataset)
+    >>> dataset.diffrender = dr.pyklip_backend.DiffrenderSettings(pixelscale=0.063)
+    >>> observation = dr.pyklip_backend.observation_from_dataset(dataset)
     >>> len(observation), observation.shape
     (2, (16, 16))
     """
@@ -241,7 +242,7 @@ def frames_of(
     index: NDArray[np.intp],
     imgs: NDArray[Any],
     settings: DiffrenderSettings,
-    library: abc.Sequence[Path] = (),
+    library: Sequence[Path] = (),
 ) -> Frames:
     """Gather the target's frames of one wavelength with their errors, masks and metadata.
 

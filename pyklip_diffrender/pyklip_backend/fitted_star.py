@@ -76,7 +76,7 @@ class FittedPointing:
         group, window, box = self.pointing.observation, self.window, self.box
         if box is not window:
             star = self._rendered(box, None)
-            if self.result.systematics is not None:
+            if self.result.pattern is not None:
                 origin = self.frame.observation.first_pixel
                 if origin is not None:
                     origin = (origin[0] - window.x, origin[1] - window.y)
@@ -84,7 +84,7 @@ class FittedPointing:
                     group, center=group.center + self.away, first_pixel=origin
                 )
                 pixels = moved.within(box)
-                star = star * (1 + self.result.systematics.at(pixels)[0])
+                star = star * (1 + self.result.pattern.at(pixels)[0])
             return self.paste(star + float(self.frame.values["background"][0]), box)
         if Window.holding(group.valid) not in window:
             _log.warning(
@@ -201,7 +201,7 @@ class Subtraction:
     # At least one; together they cover all frames.
     fits: tuple[Fit, ...]
     # Name of the pattern that was used.
-    systematics: str = "none"
+    pattern: str = "none"
     # Number of frames of reference stars that were used.
     references: int = 0
     # The parts of the fits, one for each pointing; empty for other subtractors.
@@ -214,8 +214,8 @@ class Subtraction:
     def __repr__(self) -> str:
         fits = "; ".join(f"{fit.status}, chi2/pixel {fit.chi2:.3g}" for fit in self.fits)
         return (
-            f"<Subtraction: {counted(len(self.star), 'frame')}, {fits}, flat-field pattern "
-            f"{self.systematics}>"
+            f"<Subtraction: {counted(len(self.star), 'frame')}, {fits}, detector pattern "
+            f"{self.pattern}>"
         )
 
     @property

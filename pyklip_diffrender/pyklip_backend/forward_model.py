@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Filter = Callable[[NDArray[Any]], NDArray[Any]]
 
-_APERTURE = 4.0
+_APERTURE_LAMBDA_D = 4.0
 """Radius in lambda/D of the circle in which the planet's image has the light of the user's PSF."""
 
 
@@ -79,7 +79,7 @@ def check_forward_model(fm_class: Any, settings: DiffrenderSettings) -> None:
     if settings.subtractor is not None:
         raise IncompatibleSetupError(
             "fm_class: the forward model of a planet needs the linear model of a fit by "
-            "GaussNewton, which a subtractor of your own does not have"
+            "FitSettings, which a subtractor of your own does not have"
         )
 
 
@@ -177,7 +177,7 @@ class _PlanetImage:
         if not (-0.5 < x < nx - 0.5 and -0.5 < y < ny - 0.5):
             raise IncompatibleSetupError(
                 f"fm_class: the planet is {fm_class.sep:.1f} pixels from the star, outside the "
-                f"{nx} x {ny} pixels that are fitted; give a larger fit_pixels"
+                f"{nx} x {ny} pixels that are fitted; give a larger size"
             )
         group, margin = part.pointing.observation, max(fm_class.input_psfs.shape[-2:])
         shape = (group.shape[0] + 2 * margin, group.shape[1] + 2 * margin)
@@ -197,7 +197,7 @@ class _PlanetImage:
         rows, columns = np.indices(group.shape)
         x, y = group.center[0] + offset
         pixelscale = np.sqrt(np.prod(part.frame.model.detector.pixelscale))
-        radius = _APERTURE * part.resolution / pixelscale
+        radius = _APERTURE_LAMBDA_D * part.resolution / pixelscale
         # Where the user's PSF ends there is exactly nothing.
         near = (np.hypot(columns - x, rows - y) <= radius) & (users != 0)
         scale = users[near].sum() / ours[near].sum() if near.any() else 0.0

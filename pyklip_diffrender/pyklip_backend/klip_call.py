@@ -254,7 +254,7 @@ def check_arguments(arguments: Mapping[str, Any]) -> None:
 # (see `linear.model`), so that the fit to the frames without it is all that is needed. The result
 # depends on nothing else, and not on the order of the copies.
 
-_SAME_PLACE = 0.01
+_SAME_STAR_PIXELS = 0.01
 """Pixels between the stars in frames and in their copies; centres are single precision."""
 
 
@@ -282,10 +282,9 @@ def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
 
 def _require_copy(record: ReductionRecord, frames: Frames) -> None:
     """Raise for frames that are not copies of the reduced ones with a little light added."""
-    fits = record.subtraction.fits
-    if any(getattr(fit.result, "linear", None) is None for fit in fits):
+    if any(getattr(fit.result, "linear", None) is None for fit in record.subtraction.fits):
         raise IncompatibleSetupError(
-            "injected_into: its fits have no linear model; reduce it with a GaussNewton fit"
+            "injected_into: its fits have no linear model; reduce it without a `subtractor`"
         )
     now, then = frames.observation, record.frames.observation
     same = now.data.shape == then.data.shape and frames.pixels == record.frames.pixels
@@ -293,7 +292,7 @@ def _require_copy(record: ReductionRecord, frames: Frames) -> None:
         difference = np.abs(frames.data - record.frames.data) / then.error
         # Sources change few pixels by more than the noise.
         same = bool(
-            np.abs(now.center - then.center).max() < _SAME_PLACE
+            np.abs(now.center - then.center).max() < _SAME_STAR_PIXELS
             and np.median(difference[now.valid & then.valid]) < 1
         )
     if not same:
@@ -392,7 +391,7 @@ class DatasetReduction:
                 )
 
     def _opd(self) -> OPDMap:
-        """The wavefront map to start from."""
+        """The OPD map to start from."""
         before = self._before_injection
         if before:
             return before[0].opd

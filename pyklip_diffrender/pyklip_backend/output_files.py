@@ -167,21 +167,21 @@ SPACING = 2
 """Pixels between the positions at which the throughput is computed; between them it is
 interpolated."""
 
-_DENSE = 5
+_DENSE_PIXELS = 5
 """Pixels about a companion of the fit within which every pixel is computed."""
 
-_INNER = 15
+_INNER_PIXELS = 15
 """Pixels about the star within which every pixel is computed: interpolation would err there by up
 to 15 %."""
 
-_CORE = 0.5
+_PEAK_FWHM_LAMBDA_D = 0.5
 """FWHM in lambda/D of the Gaussian with which a source's peak is measured."""
 
-_BATCH = 256
+_PLACES_AT_A_TIME = 256
 
 
 def throughput_map(
-    fit: Refinement, spacing: int = SPACING, inner: float = _INNER
+    fit: Refinement, spacing: int = SPACING, inner: float = _INNER_PIXELS
 ) -> NDArray[np.float64]:
     """Fraction (ny, nx) of a faint source's peak that is left, on the fit's first frame's pixels.
 
@@ -203,7 +203,7 @@ def throughput_map(
     # companions, at whose places no light becomes star because they are part of the model.
     dense = np.hypot(*templates.grid.transpose(2, 0, 1)) <= inner * pixel
     for _, *offset in fit.companions:
-        dense |= np.hypot(*(templates.grid - offset).transpose(2, 0, 1)) <= _DENSE * pixel
+        dense |= np.hypot(*(templates.grid - offset).transpose(2, 0, 1)) <= _DENSE_PIXELS * pixel
     filled[dense] = _at(fit, templates, *np.nonzero(dense))
     return filled
 
@@ -214,8 +214,8 @@ def _at(
     """The throughput (k,) of sources at pixels, rows and columns (k,), of the first frame."""
     star = np.array([unknown.name != "companions" for unknown in fit.linear.unknowns])
     left = np.empty(len(rows))
-    for start in range(0, len(rows), _BATCH):
-        part = slice(start, start + _BATCH)
+    for start in range(0, len(rows), _PLACES_AT_A_TIME):
+        part = slice(start, start + _PLACES_AT_A_TIME)
         images = templates.at_pixels(rows[part], columns[part])
         offsets = torch.from_numpy(templates.grid[rows[part], columns[part]])
         change = fit.linear.response(images)
@@ -239,7 +239,7 @@ def _cores(model: OpticalSystem, places: NDArray[np.float64]) -> NDArray[np.floa
     """Gaussians (k, ny, nx) narrower than a source, about rows and columns `places` (2, k)."""
     detector = model.detector
     pixel = math.sqrt(math.prod(detector.pixelscale))
-    fwhm = _CORE * model.resolution / pixel
+    fwhm = _PEAK_FWHM_LAMBDA_D * model.resolution / pixel
     y, x = (
         np.exp(-4 * math.log(2) * ((np.arange(count) - place[:, None]) / fwhm) ** 2)
         for count, place in zip(detector.shape, places, strict=True)
@@ -408,7 +408,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         "DRCHI2": worst.chi2,
         "DRNFIT": len(fits_of_all),
         "DRKEPT": companions,
-        "DRSYST": _shared(r.subtraction.systematics for r in records),
+        "DRPATTRN": _shared(r.subtraction.pattern for r in records),
         "DRREFS": sum(r.subtraction.references for r in records),
         "DRREFUSE": _shared(_use_of_references(r.subtraction) for r in records),
         "DRPIXELS": _shared(r.frames.pixels for r in records),
@@ -430,7 +430,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         "KL modes are all the same image; subsections, movement, numbasis, minrot and the number "
         "of annuli are not used"
     )
-    header.add_history("DRSHA256 is the SHA-256 of the wavefront map's file, or of its array")
+    header.add_history("DRSHA256 is the SHA-256 of the OPD map's file, or of its array")
     for record in records:
         frames, subtraction = record.frames, record.subtraction
         line = (

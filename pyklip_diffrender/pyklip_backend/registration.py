@@ -242,7 +242,7 @@ def register(
     Parameters
     ----------
     opd : path, ndarray or Quantity, optional
-        Default wavefront map, see `DiffrenderSettings`.
+        Default OPD map, see `DiffrenderSettings`.
     model : optical model, optional
         Default model; if not given, one is made for the dataset's filter.
     replace : bool, optional
@@ -259,7 +259,7 @@ def register(
 
     Examples
     --------
-    With a wavefront map and a `dataset` that pyKLIP has read, which the package does not contain:
+    With an OPD map and a `dataset` that pyKLIP has read, which the package does not contain:
 
     >>> import pyklip_diffrender as dr
     >>> dr.register(opd="R2022073003-NRCA3_FP1-1.fits")  # doctest: +SKIP
@@ -280,8 +280,8 @@ def unregister() -> None:
     Examples
     --------
     >>> import pyklip_diffrender as dr
-    >>> dr.register(fit_pixels=64)
-    >>> dr.unregister()
+    >>> dr.register(size=64)
+    >>> dr.pyklip_backend.unregister()
     """
     with REGISTRY.lock:
         REGISTRY.defaults = DiffrenderSettings()
@@ -321,9 +321,9 @@ def backend(
 
     Examples
     --------
-    With a wavefront map, a `dataset` and a `library` that pyKLIP has read:
+    With an OPD map, a `dataset` and a `library` that pyKLIP has read:
 
-    >>> with dr.backend(opd="opd.fits"):  # doctest: +SKIP
+    >>> with dr.pyklip_backend.backend(opd="opd.fits"):  # doctest: +SKIP
     ...     klip_dataset(dataset, mode="ADI+RDI", psf_library=library)
     """
     if name != ALGORITHM:

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections import abc
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -33,7 +32,7 @@ from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.integrations import pointings
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, single_precision, unflagged
 from pyklip_diffrender.scene.observation import Observation, frames_in
-from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 
 _log = logging.getLogger(__name__)
 
@@ -49,7 +48,7 @@ REFERENCES = "_diffrender_references"
 NON_SCIENCE = 512
 """The one bit of the JWST data-quality flags that pyKLIP uses: it sets such pixels to NaN."""
 
-_ROUNDING = 1e-4
+_SHIFT_ROUNDING = 1e-4
 """Difference, relative to the brightest pixel, between two shifts of the same frame, one of them
 in single precision."""
 
@@ -85,7 +84,7 @@ class SourceFrames:
     paths: list[Path]
     files: dict[Path, FrameFile]
     # What the files were sorted into, if they were judged before pyKLIP read them.
-    sequence: Sequence | None = None
+    sequence: ExposureSequence | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
         """Itself: it never changes, so copies of a dataset can share it."""
@@ -159,7 +158,7 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
             first = align_and_scale(as_read[0], new_center=middle, old_center=center)
         files.append(file)
     counts = [len(file.data) for file in files]
-    judged = _JUDGED.get()
+    judged = _JUDGED_FILES.get()
     source = SourceFrames(
         headers=[file.header for file, n in zip(files, counts, strict=True) for _ in range(n)],
         data=_joined([file.data for file in files]),
@@ -183,7 +182,7 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
     return source
 
 
-def _joined(stacks: abc.Sequence[NDArray[Any]]) -> NDArray[Any]:
+def _joined(stacks: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Frames of all files, (N, ny, nx), without a copy if there is a single file."""
     return stacks[0] if len(stacks) == 1 else np.concatenate(stacks)
 
@@ -191,7 +190,7 @@ def _joined(stacks: abc.Sequence[NDArray[Any]]) -> NDArray[Any]:
 def _is_close(one: NDArray[Any], other: NDArray[Any]) -> bool:
     """Whether two frames differ by no more than rounding."""
     scale = np.max(np.abs(other), where=np.isfinite(other), initial=0.0)
-    return np.allclose(one, other, rtol=0.0, atol=_ROUNDING * scale, equal_nan=True)
+    return np.allclose(one, other, rtol=0.0, atol=_SHIFT_ROUNDING * scale, equal_nan=True)
 
 
 class _File(NamedTuple):
@@ -286,25 +285,25 @@ class JudgedFiles(NamedTuple):
     """Files that were opened and judged before pyKLIP reads them, by path."""
 
     files: Mapping[Path, OpenedFile]
-    sequence: Sequence
+    sequence: ExposureSequence
 
 
-_JUDGED: ContextVar[JudgedFiles | None] = ContextVar("judged", default=None)
+_JUDGED_FILES: ContextVar[JudgedFiles | None] = ContextVar("judged", default=None)
 
 
 @contextmanager
 def judged_before(files: JudgedFiles) -> Iterator[None]:
     """Take files that were opened already for datasets that are read inside."""
-    token = _JUDGED.set(files)
+    token = _JUDGED_FILES.set(files)
     try:
         yield
     finally:
-        _JUDGED.reset(token)
+        _JUDGED_FILES.reset(token)
 
 
 def _read(path: str, dataset: Any) -> tuple[_File, NDArray[np.floating[Any]], NDArray[np.float64]]:
     """Read one file as `reduce` does, and its pixels, (N, ny, nx), and star, (2,), as pyKLIP."""
-    judged = _JUDGED.get()
+    judged = _JUDGED_FILES.get()
     known = None if judged is None else judged.files.get(Path(path).absolute())
     file, primary, science, as_read, usable, frames, aligned = known or OpenedFile.at(path)
     header = merged_header(primary, science, path)
@@ -361,7 +360,7 @@ def keeping_references(readpsflib: Callable[..., None]) -> Callable[..., None]:
 # are known, the fit gets those, plus whatever was added to ``dataset.input`` since (an injected
 # companion, for example). Only the subtracted frames are then shifted.
 
-_SINGLE_PRECISION = 1e-5
+_SINGLE_PRECISION_ERROR = 1e-5
 """Relative difference of pixels that single precision explains."""
 
 
@@ -423,7 +422,7 @@ def recorded_frames(
         added = np.where(np.isfinite(change), change, 0.0)
         # A changed factor is known to the rounding of single precision.
         peak = np.max(np.abs(before), where=np.isfinite(before), initial=0.0)
-        if np.abs(added).max() > _SINGLE_PRECISION * peak:
+        if np.abs(added).max() > _SINGLE_PRECISION_ERROR * peak:
             # Nothing is known beyond the edge of the shifted frame; assume nothing was added.
             data[i] += np.nan_to_num(align_and_scale(added, **shift))
         if masked.any():
@@ -449,9 +448,9 @@ def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
     ratios = now[bright] / before[bright]
     factor = float(np.median(ratios))
     # Sources that were added since change few of the brightest pixels.
-    if abs(factor - 1) < _SINGLE_PRECISION or np.median(
+    if abs(factor - 1) < _SINGLE_PRECISION_ERROR or np.median(
         np.abs(ratios - factor)
-    ) > _SINGLE_PRECISION * abs(factor):
+    ) > _SINGLE_PRECISION_ERROR * abs(factor):
         return 1.0
     if factor <= 0:
         raise NotRecordedError(f"its frames were multiplied by {factor:.3g} after reading")
@@ -518,7 +517,7 @@ def part_of(observation: Observation, which: Any) -> Observation:
 
 
 def pointings_of(
-    observation: Observation, details: abc.Sequence[FrameDetails] | None = None
+    observation: Observation, details: Sequence[FrameDetails] | None = None
 ) -> list[Pointing]:
     """Sort the frames of an observation by file and by place of the star, in order of time.
 

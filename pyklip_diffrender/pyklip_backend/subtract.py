@@ -22,7 +22,7 @@ from pyklip_diffrender.pyklip_backend.fitted_star import (
 )
 from pyklip_diffrender.pyklip_backend.source_frames import Pointing, pointings_of
 from pyklip_diffrender.scene.observation import Observation, Window
-from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
@@ -64,7 +64,7 @@ def subtract_by_refinement(
     from pyklip_diffrender.reduction import prepare
     from pyklip_diffrender.reduction.fit_status import warn_of_status
 
-    sequence = FrameSequence(observation.target, science, tuple(references))
+    sequence = ExposureSequence(observation.target, science, tuple(references))
     options = _options(settings, observation, references)
     preparation = prepare(sequence, opd, options, model=model)
     tell(
@@ -76,7 +76,7 @@ def subtract_by_refinement(
     with heard_by(tell):
         reduction = preparation.run()
     fit, number = reduction.fit, len(reduction.detection.sources)
-    tell(f"{_described(fit)}, {fit.seconds:.0f} s, flat-field pattern: {reduction.pattern}")
+    tell(f"{_described(fit)}, {fit.seconds:.0f} s, detector pattern: {reduction.pattern_origin}")
     tell(f"{counted(number, 'companion')} detected")
     warn_of_status(science[0].name, fit)
     if references and not reduction.reference_frames:
@@ -108,7 +108,7 @@ def subtract_by_refinement(
     return Subtraction(
         star,
         (Fit(tuple(map(int, frames)), fit.status.name, float(fit.chi2_per_pixel), fit),),
-        "none" if reduction.systematics is None else reduction.systematics.name,
+        "none" if reduction.pattern is None else reduction.pattern.name,
         reduction.reference_frames,
         fitted,
         reduction,
@@ -147,11 +147,8 @@ def _options(
     """Options of the reduction; settings that are None have the defaults of `reduce`."""
     from pyklip_diffrender.reduction.fit_status import MAX_CHI2
 
-    own = {
-        "settings": settings.fit,
-        "systematics": _requested_pattern(settings, observation, references),
-    }
-    return ReduceOptions(**{"max_chi2": MAX_CHI2, **settings.given, **own})
+    pattern = _requested_pattern(settings, observation, references)
+    return ReduceOptions(**{"max_chi2": MAX_CHI2, **settings.given, "pattern": pattern})
 
 
 def _requested_pattern(
@@ -163,12 +160,12 @@ def _requested_pattern(
     """
     from pyklip_diffrender.pattern import as_request
 
-    requested = settings.systematics
+    requested = settings.pattern
     if requested is None:
         return "auto" if observation.is_nircam else "off"
     if requested == "references" and not references:
         raise IncompatibleSetupError(
-            "systematics='references' needs frames of reference stars: give them to JWSTData as "
+            "pattern='references' needs frames of reference stars: give them to JWSTData as "
             "psflib_filepaths after register(), and RDI in the mode and psf_library= to "
             "klip_dataset"
         )
@@ -200,7 +197,7 @@ def model_of(
         options = {"pixelscale": observation.pixelscale, **options}
     is_quick = settings.accuracy == "quick"
     most = QUICK_SIDE if is_quick else FIT_PIXELS
-    size = settings.fit_pixels or min(most, *Window.holding(observation.valid).shape)
+    size = settings.size or min(most, *Window.holding(observation.valid).shape)
     if is_quick:
         # Takes a second to import.
         from pyklip_diffrender.refinement import coarse_arguments

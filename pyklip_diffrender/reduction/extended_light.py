@@ -7,10 +7,10 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 from scipy import stats
 
-_UNLIKELY = 0.01
+_CHANCE_PROBABILITY = 0.01
 """Probability below which unrelated sources are not taken to be arranged by chance."""
 
-_NEAR = 1.5
+_NEIGHBOURS_LAMBDA_D = 1.5
 """Separation of neighbours, lambda/D: one extended source is found as several this close."""
 
 
@@ -31,15 +31,15 @@ def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
         # All axes are in the arc that is left by the largest gap. The probability that n random
         # axes are in an arc a of their circle, a < 1/2, is n a^(n - 1).
         arc = 1 - gaps.max() / 180
-        if arc < 0.5 and count * arc ** (count - 1) < _UNLIKELY:
+        if arc < 0.5 and count * arc ** (count - 1) < _CHANCE_PROBABILITY:
             return "The candidates are in line with the star, like an edge-on disk"
     places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
     distances = np.hypot(*(places[:, None] - places).T)[np.triu_indices(count, 1)]
     # Each of the n (n - 1) / 2 pairs is within reach of each other with the probability
     # (reach / edge)^2, the ratio of two areas, so that their number is nearly Poisson's.
-    reach = _NEAR * resolution
+    reach = _NEIGHBOURS_LAMBDA_D * resolution
     expected = len(distances) * (reach / edge) ** 2
-    if stats.poisson.sf((distances < reach).sum() - 1, expected) < _UNLIKELY:
+    if stats.poisson.sf((distances < reach).sum() - 1, expected) < _CHANCE_PROBABILITY:
         return "Candidates are next to each other, like parts of an extended source"
     return ""
 

@@ -18,27 +18,27 @@ _ADVICE = {
     Status.MODEL_MISMATCH: (
         "Errors of candidates are scaled to the scatter in the S/N map, and the reduction takes "
         "part in a combined search. See whether a faint candidate is in every roll and looks like "
-        "a point source, and check the filter, the masks and the date of the wavefront map. For a "
+        "a point source, and check the filter, the masks and the date of the OPD map. For a "
         "star with a disk, use the option disk."
     ),
     Status.PRIOR_MISMATCH: (
         "The prior was widened to the size of the wavefront, which still exceeds it. Errors of "
         "candidates are scaled to the scatter in the S/N map, and the reduction takes part in a "
-        "combined search. Check the wavefront map, and take one that is nearer in time."
+        "combined search. Check the OPD map, and take one that is nearer in time."
     ),
     Status.ITERATION_LIMIT: (
         "The result is the best iterate. If chi-squared was still falling in the history of the "
-        "fit, repeat it with more steps, such as GaussNewton.nircam(max_iterations=80); if it "
-        "hardly changed, try a wavefront map nearer in time."
+        "fit, repeat it with more steps, such as FitSettings.nircam(max_iterations=80); if it "
+        "hardly changed, try an OPD map nearer in time."
     ),
     Status.DIVERGED: (
-        "Do not use this result. Check the unit and orientation of the wavefront map, the position "
+        "Do not use this result. Check the unit and orientation of the OPD map, the position "
         "of the star and the pixel mask."
     ),
 }
 
 _REFERENCES = (
-    " The flat-field pattern was not known: add reference stars, or the systematics.fits of an "
+    " The detector pattern was not known: add reference stars, or the pattern.fits of an "
     "earlier reduction."
 )
 
@@ -54,7 +54,7 @@ def require_plausible(name: str, result: Refinement, limit: float) -> None:
         raise RefinementError(
             f"{name}: reduced chi-squared is {chi2:.3g}, above max_chi2={limit:g}: the rendered "
             f"star is not the star in these frames. {WHAT_TO_CHECK} For a companion as bright as "
-            "the star's halo, give fit=GaussNewton.nircam(companions=...). max_chi2=inf subtracts "
+            "the star's halo, give fit=FitSettings.nircam(companions=...). max_chi2=inf subtracts "
             "whatever was fitted",
             result,
         )
@@ -63,7 +63,7 @@ def require_plausible(name: str, result: Refinement, limit: float) -> None:
 def warn_of_status(name: str, result: Refinement) -> None:
     """Warn of a fit that is usable but has not converged, and say what to do about it."""
     if result.status is not Status.CONVERGED:
-        todo = advice(result.status, patterned=result.systematics is not None)
+        todo = advice(result.status, patterned=result.pattern is not None)
         warnings.warn(
             f"{name}: the fit ended as {result.status} (chi-squared per pixel "
             f"{result.chi2_per_pixel:.3g}). What to do: {todo} See 'Reading a status' in the "
@@ -74,6 +74,6 @@ def warn_of_status(name: str, result: Refinement) -> None:
 
 
 def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
-    """Advice about the status of a fit, with or without a known flat-field pattern."""
+    """Advice about the status of a fit, with or without a known detector pattern."""
     missing = _REFERENCES if status is Status.MODEL_MISMATCH and not patterned else ""
     return f"{_ADVICE[status]}{missing} {remark}".rstrip()

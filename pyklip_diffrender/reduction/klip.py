@@ -36,12 +36,12 @@ from pyklip_diffrender.scene.star_place import without_gaps
 
 Image = NDArray[np.float64]
 
-_SIGMAS = 5.0
+_LIMIT_SNR = 5.0
 
-_MODES = 5
+_MOST_KL_MODES = 5
 """Largest number of KL modes."""
 
-_INNER = 1.4
+_INNER_RADIUS_LAMBDA_D = 1.4
 """Radius in lambda/D within which KLIP does not subtract the star."""
 
 _FIRST = 2
@@ -53,16 +53,16 @@ _COUNT = 12
 _TRIALS = 4
 """Position angles at which planets are injected at every separation."""
 
-_GOLDEN = 137.5
+_TURN_DEG = 137.5
 """Degrees from the planets at one separation to the planets at the next."""
 
-_TURN = 1.0
+_OTHER_ROLL_DEG = 1.0
 """Degrees between rolls that are references of each other."""
 
-_HALF = 10
+_FILTER_HALF_PIXELS = 10
 """Pixels from the middle of the matched filter to its edge."""
 
-_CLOSE = 1.5
+_CLOSE_PIXELS = 1.5
 """Pixels about the position of an injected planet in which its peak is sought."""
 
 
@@ -156,12 +156,12 @@ def klip_curve(
     # has limits, and the response to an injected planet of contrast 1. At every separation the
     # number of modes is the one with the best limit.
     # So faint that the modes hardly change.
-    contrasts = _SIGMAS * noise.min(axis=0) / klip.norm
+    contrasts = _LIMIT_SNR * noise.min(axis=0) / klip.norm
     response, alone = np.zeros_like(noise), np.zeros(len(separations))
     for s, separation in enumerate(separations):
         # Evenly spread at every separation, and from one separation to the next by the golden
         # angle, so that no direction is preferred.
-        angles = np.radians(_GOLDEN * s + 360 / _TRIALS * np.arange(_TRIALS))
+        angles = np.radians(_TURN_DEG * s + 360 / _TRIALS * np.arange(_TRIALS))
         wanted = separation * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         rows, columns = np.array([klip.pixel(each) for each in wanted]).T
         light = templates.at_pixels(rows, columns)
@@ -171,17 +171,19 @@ def klip_curve(
             planets = contrasts[s] * np.array([each[n].double().numpy() for each in light.values()])
             added = klip.science + shift_frames(planets, klip.shifts)
             changes = klip.images(added) - plain
-            close = np.hypot(*np.moveaxis(klip.grid - place, -1, 0)) < _CLOSE * klip.pixelscale
+            close = (
+                np.hypot(*np.moveaxis(klip.grid - place, -1, 0)) < _CLOSE_PIXELS * klip.pixelscale
+            )
             response[:, s] += changes[:, close].max(axis=1) / _TRIALS
     # No noise, no planet: a ring inside KLIP's mask.
     response = np.divide(response, contrasts, out=np.zeros_like(response), where=contrasts > 0)
     useful = (response > 0) & (noise > 0)
-    limits = np.divide(_SIGMAS * noise, response, out=np.full_like(noise, np.inf), where=useful)
+    limits = np.divide(_LIMIT_SNR * noise, response, out=np.full_like(noise, np.inf), where=useful)
     best = limits.argmin(axis=0), np.arange(len(separations))
     limit = np.where(np.isfinite(limits[best]), limits[best], np.nan)
-    corrected = limit * small_sample_factor(separations, resolution, _SIGMAS)
+    corrected = limit * small_sample_factor(separations, resolution, _LIMIT_SNR)
     return add_columns(
-        QTable(meta={"sigmas": _SIGMAS, "resolution_arcsec": resolution, "label": klip.label}),
+        QTable(meta={"sigmas": _LIMIT_SNR, "resolution_arcsec": resolution, "label": klip.label}),
         [
             ("separation", separations, u.arcsec, ".3f", "from the star"),
             ("contrast", limit, None, ".2e", "limit with the best number of modes"),
@@ -204,7 +206,7 @@ def klip_image(
     references: Sequence[Observation] = (),
     science: Sequence[Observation] | None = None,
     *,
-    modes: int = _MODES,
+    modes: int = _MOST_KL_MODES,
     north: float = 0.0,
 ) -> tuple[Image, Image, str]:
     """Subtract the star from the frames that were searched with KLIP, and combine them.
@@ -291,24 +293,24 @@ class KlipSubtraction:
         # (ny, nx, 2) and (ny, nx): x, y of the pixels from the star, and the distance, arcsec.
         self.grid = (np.stack([x, y], axis=-1) - self.center) * scales
         self.distance = np.hypot(self.grid[..., 0], self.grid[..., 1])
-        self._zone = self.distance > _INNER * resolution
+        self._zone = self.distance > _INNER_RADIUS_LAMBDA_D * resolution
         self._library = [
-            [j for j, other in enumerate(self.rolls) if abs(other - roll) > _TURN]
+            [j for j, other in enumerate(self.rolls) if abs(other - roll) > _OTHER_ROLL_DEG]
             for roll in self.rolls
         ]
         fewest = min(map(len, self._library)) + len(self.references)
         if not fewest:
             raise IncompatibleSetupError(
                 "klip_curve: got a roll without references, expected frames of reference stars or "
-                f"rolls that differ by more than {_TURN:g} degree"
+                f"rolls that differ by more than {_OTHER_ROLL_DEG:g} degree"
             )
         # (modes,), numbers of Karhunen-Loeve modes.
-        self.modes = np.arange(1, min(_MODES, fewest) + 1)
+        self.modes = np.arange(1, min(_MOST_KL_MODES, fewest) + 1)
         # Halfway to the edge the mask does not matter.
         row, column = self.pixel(np.array([self.grid[0, -1, 0] / 2, 0.0]))
         image = templates.at_pixels(np.array([row]), np.array([column]))[0][0].double().numpy()
-        side = 2 * _HALF + 1
-        kernel = np.pad(image, _HALF)[row : row + side, column : column + side]
+        side = 2 * _FILTER_HALF_PIXELS + 1
+        kernel = np.pad(image, _FILTER_HALF_PIXELS)[row : row + side, column : column + side]
         self.norm = float(np.sqrt((kernel**2).sum()))
         """Peak of a planet of contrast 1 in a smoothed image before any subtraction."""
         self._kernel = kernel[::-1, ::-1] / self.norm

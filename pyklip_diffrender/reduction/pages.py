@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-_SENTENCE_AT = 1.5
+_SENTENCE_LIMIT_ARCSEC = 1.5
 """Separation, arcsec, near which the first sentence states the limit."""
 
 _RECENT_DAYS = 7.0
-"""Days from the frames to a wavefront map up to which it passes without a remark: maps are made
+"""Days from the frames to an OPD map up to which it passes without a remark: maps are made
 every two days, and one of a week before is rarely the nearest."""
 
-_TINY = 1e-9
+_SMALLEST_STATED_PROBABILITY = 1e-9
 """Probabilities below this rest on tails that no noise is known to follow."""
 
 
 def remark_on_map(days: float | None) -> str:
-    """Remark on a wavefront map so many days from the frames; empty for one of the same week."""
+    """Remark on an OPD map so many days from the frames; empty for one of the same week."""
     if days is None or abs(days) <= _RECENT_DAYS:
         return ""
     return (
-        f"The wavefront map was sensed {abs(days):.0f} days "
+        f"The OPD map was sensed {abs(days):.0f} days "
         f"{'before' if days > 0 else 'after'} the frames. JWST's is sensed every two days or so: a "
         "map nearer in time is a better start."
     )
@@ -108,7 +108,9 @@ def _limit(summary: Mapping[str, Any]) -> Sequence[str]:
     """The faintest planet that would have been seen, if that is known anywhere."""
     if not summary["limits"]:
         return []
-    row = min(summary["limits"], key=lambda each: abs(each["separation_arcsec"] - _SENTENCE_AT))
+    row = min(
+        summary["limits"], key=lambda each: abs(each["separation_arcsec"] - _SENTENCE_LIMIT_ARCSEC)
+    )
     threshold = summary["threshold_snr"]
     contrast = row["contrast"] * threshold / summary["contrast_curve"]["sigmas"]
     return [
@@ -147,8 +149,8 @@ def probability(value: float | None) -> str:
     """A probability of a false alarm; "not stated" for None."""
     if value is None:
         return "not stated"
-    if value < _TINY:
-        return f"< {scientific(_TINY).replace('1.0 × ', '')}"
+    if value < _SMALLEST_STATED_PROBABILITY:
+        return f"< {scientific(_SMALLEST_STATED_PROBABILITY).replace('1.0 × ', '')}"
     return scientific(value) if value < 0.01 else f"{value:.2f}"
 
 

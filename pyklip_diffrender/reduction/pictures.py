@@ -137,7 +137,7 @@ class SkyImages:
 _log = logging.getLogger(__name__)
 
 
-_LINEAR = 5.0
+_LINEAR_SIGMAS = 5.0
 """Linear part of the scale for light, standard deviations of the noise."""
 
 
@@ -211,7 +211,7 @@ class Overview:
             image, grid, title = self.klip.image, self.klip.grid, self.klip.label
         drawing.signed_image(
             ax, image, grid, float(np.nanmax(np.abs(mean))), bar=self._unit, title=title,
-            places=self._places, linear=_LINEAR * float(np.nanmedian(error)), north=north,
+            places=self._places, linear=_LINEAR_SIGMAS * float(np.nanmedian(error)), north=north,
         )  # fmt: skip
         pixel = self.images.grid[0, 1, 0] - self.images.grid[0, 0, 0]
         half = np.abs(self.images.grid).max() + pixel / 2
@@ -255,7 +255,7 @@ Pictures = Sequence[Picture]
 MOST_FRAMES = 4
 """Largest number of frames, and of candidates, with pictures."""
 
-_STAMP = 0.45
+_HALF_STAMP_ARCSEC = 0.45
 """Half of the side of the pictures of a candidate, arcsec."""
 
 
@@ -439,7 +439,7 @@ def _stamps(detection: Detection, place: int) -> dict[int, drawing.Stamp]:
         observation = frame.observation.combined()
         own = float(sources.contrasts[index]) * light[k][0].numpy()
         row, column = np.rint(templates.pixels_of(k, offset)[:, 0]).astype(int)
-        half = max(3, round(_STAMP / float(np.sqrt(np.prod(observation.pixelscale)))))
+        half = max(3, round(_HALF_STAMP_ARCSEC / float(np.sqrt(np.prod(observation.pixelscale)))))
         window = Window(row - half, column - half, (2 * half + 1, 2 * half + 1))
         valid = observation.valid[0]
         # A source just beyond the fitted pixels is seen in these by its side lobes only.
@@ -597,18 +597,18 @@ def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
 
 def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[Picture]:
     """The wavefront before and after the fit."""
-    fit, about = reduction.fit, summary["wavefront_map"]
+    fit, about = reduction.fit, summary["opd"]
     before, after = wavefronts(fit)
     rms = [number(about[f"{key}rms_nm"], ".1f", "nm") for key in ("", "refined_", "change_")]
     figures, axes = _panels(3)
     width = fit.model.diameter
     limit = float(np.nanpercentile(np.abs([before, after]), 99.5)) or 1.0
-    drawing.wavefront_map(axes[0], before, width, title="Before the fit", limit=limit)
-    drawing.wavefront_map(axes[1], after, width, title="After the fit", limit=limit)
-    drawing.wavefront_map(axes[2], after - before, width, title="Change")
+    drawing.opd_map(axes[0], before, width, title="Before the fit", limit=limit)
+    drawing.opd_map(axes[1], after, width, title="After the fit", limit=limit)
+    drawing.opd_map(axes[2], after - before, width, title="Change")
     words = {
         "wavefront_before": (
-            f"The wavefront map that the fit started from ({about['name']}), {rms[0]} rms."
+            f"The OPD map that the fit started from ({about['name']}), {rms[0]} rms."
         ),
         "wavefront_after": f"The wavefront of the first frame after the fit, {rms[1]} rms.",
         "wavefront_change": (

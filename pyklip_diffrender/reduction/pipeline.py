@@ -55,7 +55,7 @@ from pyklip_diffrender.reduction.visit import (
     with_references,
 )
 from pyklip_diffrender.refinement import (
-    GaussNewton,
+    FitSettings,
     Refinement,
     coarse_arguments,
     quick_settings,
@@ -67,24 +67,24 @@ from pyklip_diffrender.refinement import (
     to_jansky,
     with_star_flux,
 )
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern, caveat, require_pattern_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.sequence import OF_ANOTHER_EPOCH, Sequence
+from pyklip_diffrender.scene.sequence import OF_ANOTHER_EPOCH, ExposureSequence
 from pyklip_diffrender.scene.simulation import model_for, within_field
-from pyklip_diffrender.scene.systematics import Systematics, caveat, require_pattern_of
-from pyklip_diffrender.wavefront.opd import OUTDATED_DAYS, wavefront_for
+from pyklip_diffrender.wavefront.opd import OUTDATED_DAYS, opd_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # The result of a reduction.
 
-_ALIGNING = 4
+_ALIGNMENT_STEPS = 4
 """Steps of the alignment with which bright sources beyond the fitted pixels are looked for."""
 
-_LARGE = 4.0
-"""Chi-squared per pixel above which more is missing than what real frames leave where the pattern
-of the flat field is known: at most 1.6 for stars without a disk, 5 to 32 for AU Mic."""
+_UNEXPLAINED_CHI2 = 4.0
+"""Chi-squared per pixel above which more is missing than what real frames leave where the detector
+pattern is known: at most 1.6 for stars without a disk, 5 to 32 for AU Mic."""
 
-_HOPELESS = 100.0
+_HOPELESS_CHI2 = 100.0
 """Chi-squared per pixel that no disk explains: the star is misplaced, or the set-up is wrong."""
 
 
@@ -92,13 +92,13 @@ _HOPELESS = 100.0
 class ReductionResult:
     """Result of a reduction; `Reduction` documents its attributes, and writes them."""
 
-    sequence: Sequence
+    sequence: ExposureSequence
     fit: Refinement
     detection: Detection
     references: tuple[Refinement, ...] = ()
-    systematics: Systematics | None = None
+    pattern: DetectorPattern | None = None
     failed: tuple[tuple[str, str], ...] = ()
-    pattern: str = "none"
+    pattern_origin: str = "none"
     visit: Visit = field(default_factory=Visit)
     wide: WideField | None = None
     disk: Disk | None = None
@@ -115,17 +115,17 @@ class ReductionResult:
     @property
     def remark(self) -> str:
         """Advice about a poor fit, or about extended light; else empty."""
-        if self.fit.chi2_per_pixel > _HOPELESS:
+        if self.fit.chi2_per_pixel > _HOPELESS_CHI2:
             return (
                 "The residual is so far above the noise that something basic is wrong: check that "
                 "the star is behind the mask where the header says, that filter and mask are those "
-                "of the header, that no frame is damaged, and the unit of the wavefront map."
+                "of the header, that no frame is damaged, and the unit of the OPD map."
             )
         if self.disk is not None:
             resolution = self.detection.contrast_curve.meta["resolution_arcsec"]
             return on_extended_light(self.detection.candidates, self.disk.offsets, resolution)
         reason = self.extended
-        if not reason and self.systematics is not None and self.fit.chi2_per_pixel > _LARGE:
+        if not reason and self.pattern is not None and self.fit.chi2_per_pixel > _UNEXPLAINED_CHI2:
             reason = "The residual is far above the noise, as it is where the star has a disk"
         if not reason:
             return ""
@@ -151,10 +151,10 @@ class ReductionResult:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
 
     def __str__(self) -> str:
-        known = "none" if self.systematics is None else f"from {self.systematics.name}"
+        known = "none" if self.pattern is None else f"from {self.pattern.name}"
         return (
             f"{self.sequence!r}\n{self._status}\n"
-            f"flat-field pattern: {known}\n{self._references}{self.search}\n{self.remark}"
+            f"detector pattern: {known}\n{self._references}{self.search}\n{self.remark}"
         ).rstrip()
 
     @property
@@ -173,7 +173,7 @@ class ReductionResult:
             "Frames": f"{len(self.sequence.science)} of the target, "
             f"{len(self.sequence.references)} of reference stars",
             "Filter": self.sequence.filter,
-            "Flat-field pattern": "none" if self.systematics is None else self.systematics.name,
+            "Detector pattern": "none" if self.pattern is None else self.pattern.name,
         }
         if self.remark:
             facts["Remark"] = self.remark
@@ -194,7 +194,7 @@ _log = logging.getLogger(__name__)
 
 
 def prepare(
-    sequence: Sequence,
+    sequence: ExposureSequence,
     opd: Any,
     options: ReduceOptions,
     *,
@@ -206,23 +206,23 @@ def prepare(
     must be inside the frames. With a model, as many pixels as its detector has are fitted; those
     beyond the edges of the frames are masked. Raises as `reduce`.
     """
-    wavefront = wavefront_for(opd, sequence.date)
+    wavefront = opd_for(opd, sequence.date)
     is_folder = isinstance(opd, str | os.PathLike) and Path(opd).is_dir()
     days = None if sequence.date is None else wavefront.days_after(sequence.date)
     # An older one has been warned of.
     if days is not None and abs(days) <= OUTDATED_DAYS and (remark := remark_on_map(-days)):
         _log.warning("%s", remark)
 
-    def map_for(date: Time | None) -> OPDMap:
+    def opd_at(date: Time | None) -> OPDMap:
         """Map nearest to a date, if there is a folder of maps."""
-        return wavefront_for(opd, date) if is_folder and date is not None else wavefront
+        return opd_for(opd, date) if is_folder and date is not None else wavefront
 
     if options.star_flux is not None:
         for each in sequence.science:
             require_calibrated(each)
     elif not wavefront.data.any() and sequence.science[0].is_nircam:
         _log.warning(
-            "without a wavefront map the star's flux, and contrasts with it, may be wrong by 40 %; "
+            "without an OPD map the star's flux, and contrasts with it, may be wrong by 40 %; "
             "give the flux with the option star_flux"
         )
     sequence = _within_field(sequence)
@@ -245,22 +245,22 @@ def prepare(
         )
     )
     cut = replace(cut, science=science, references=references)
-    given = options.systematics
-    if isinstance(given, Systematics):
+    given = options.pattern
+    if isinstance(given, DetectorPattern):
         for each in science:
             require_pattern_of(given, each)
         remark = caveat(given, science[0])
         if remark:
-            _log.warning("systematics: the pattern %r: %s", given.name, remark)
+            _log.warning("pattern %r: %s", given.name, remark)
     elif isinstance(given, PatternLibrary) and not given.matching(science[0]):
         _log.warning(
-            "systematics: none of the %d patterns that were given is of other stars, these pixels, "
+            "pattern: none of the %d patterns that were given is of other stars, these pixels, "
             "detector, mask and filter", len(given.patterns)
         )  # fmt: skip
-    return Preparation(sequence, cut, model, wavefront, options, settings, map_for)
+    return Preparation(sequence, cut, model, wavefront, options, settings, opd_at)
 
 
-def _within_field(sequence: Sequence) -> Sequence:
+def _within_field(sequence: ExposureSequence) -> ExposureSequence:
     """The frames without the pixels beyond the field of their mask, as in a subarray."""
     largest = sequence.science[0].shape
     science, references = (
@@ -274,16 +274,20 @@ def _within_field(sequence: Sequence) -> Sequence:
     return replace(sequence, science=science, references=references)
 
 
-def frames_in_likelihood(sequence: Sequence, options: ReduceOptions) -> tuple[Observation, ...]:
+def frames_in_likelihood(
+    sequence: ExposureSequence, options: ReduceOptions
+) -> tuple[Observation, ...]:
     """Frames of reference stars that may be fitted together with the target's."""
     # The light of a disk would have to be told from the wavefront of other stars first.
     joins = options.references == "joint" and not options.disk
     return sequence.same_epoch if joins else ()
 
 
-def frames_for_pattern(sequence: Sequence, options: ReduceOptions) -> tuple[Observation, ...]:
+def frames_for_pattern(
+    sequence: ExposureSequence, options: ReduceOptions
+) -> tuple[Observation, ...]:
     """Frames of reference stars that are fitted for the pattern, where no library has it."""
-    if options.systematics == "references" or options.references == "pattern":
+    if options.pattern == "references" or options.references == "pattern":
         return sequence.references
     if options.references == "off":
         return ()
@@ -295,16 +299,16 @@ class Preparation:
     """A reduction that was checked and can begin."""
 
     # The frames, and the same cut to the fitted pixels.
-    whole: Sequence
-    sequence: Sequence
+    whole: ExposureSequence
+    sequence: ExposureSequence
     model: OpticalSystem
     # To start from.
     wavefront: OPDMap
     options: ReduceOptions
     # Fit settings; None: the defaults of `refine`.
-    settings: GaussNewton | None = None
+    settings: FitSettings | None = None
     # The wavefront to start from at another date; None for the same at all dates.
-    map_for: Callable[[Time | None], OPDMap] | None = None
+    opd_at: Callable[[Time | None], OPDMap] | None = None
 
     def run(self, *, progress: bool = False, products: Keeper | None = None) -> ReductionResult:
         """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
@@ -332,11 +336,11 @@ class _Run:
             self.preparation.model,
             self.preparation.wavefront,
             self._first_fit,
-            systematics=options.systematics,
+            pattern=options.pattern,
             settings=self.preparation.settings,
             memory=options.memory,
             progress=self.progress,
-            map_for=self.preparation.map_for,
+            opd_at=self.preparation.opd_at,
         )
         fit, visit, detection = self._with_references(fit, choice)
         self._say_what_is_unused(visit)
@@ -353,7 +357,7 @@ class _Run:
                 detection.fits[0],
                 detection,
                 choice.references,
-                choice.systematics,
+                choice.pattern,
                 choice.failed,
                 choice.label,
                 visit,
@@ -440,7 +444,7 @@ class _Run:
             companions=(),
             max_companions=0,
             companions_if_stalled=False,
-            max_iterations=_ALIGNING,
+            max_iterations=_ALIGNMENT_STEPS,
         )
         return refine(
             prepared.model,
@@ -460,7 +464,7 @@ class _Run:
                 require_agreement_of_flux(aligned, to_jansky(stated))
 
     def _first_fit(self, choice: PatternChoice, again: bool) -> Refinement:
-        without = ", without the library's flat-field pattern" if again else ""
+        without = ", without the library's detector pattern" if again else ""
         with stage(f"wavefront{without}"):
             return self._fit(choice.science, choice)
 
@@ -478,7 +482,7 @@ class _Run:
             self.preparation.wavefront,
             settings=settings,
             start=options.start,
-            systematics=choice.systematics,
+            pattern=choice.pattern,
             progress=self.progress,
         )
         self._require_plausible(fit)
@@ -543,8 +547,8 @@ class _Run:
 
     def _with_all_references(self, joined: Joined, choice: PatternChoice) -> Visit:
         """The use of every frame of a reference star, in the joint fit or not."""
-        systematics = joined.fit.systematics
-        taught = set() if systematics is None else set(systematics.provenance.get("frames", ()))
+        pattern = joined.fit.pattern
+        taught = set() if pattern is None else set(pattern.provenance.get("frames", ()))
         fitted = {f.observation.name for fit in choice.references for f in fit.frames} & taught
         known = {each.name: each for each in joined.visit.contributions}
         contributions = []
@@ -570,9 +574,9 @@ class _Run:
         is_near = any(each is reference for each in self.preparation.sequence.same_epoch)
         where = "" if is_near else f"{OF_ANOTHER_EPOCH}, and "
         why = {
-            "library": "the library knows the pattern (systematics='references' adds theirs)",
+            "library": "the library knows the pattern (pattern='references' adds theirs)",
             "given": "the pattern was given",
-            "off": "systematics is 'off'",
+            "off": "pattern is 'off'",
         }.get(choice.origin, "there are too few frames for a pattern, two at least")
         return where + why
 
@@ -583,7 +587,7 @@ class _Run:
         (_log.warning if visit.unused else _log.info)("%s", visit.in_words())
         sequence, options = self.preparation.sequence, self.preparation.options
         named = any(row.is_named for row in sequence.rows if row.use == "reference")
-        asked = named or options.systematics == "references"
+        asked = named or options.pattern == "references"
         if asked and len(visit.unused) == len(visit.contributions):
             warnings.warn(
                 f"{sequence.target}: no frame of a reference star is used: {visit.in_words()}",

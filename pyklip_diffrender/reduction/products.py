@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections import abc
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -57,12 +56,12 @@ def page(
         tone="good" if status["name"] == "CONVERGED" else "warn" if status["usable"] else "bad",
         message=message[:1].upper() + message[1:] + ("" if message.endswith(".") else "."),
         key_facts=_key_facts(summary),
-        sky_columns=[each for each in _SKY if first and each.key in first[0]],
+        sky_columns=[each for each in _SKY_COLUMNS if first and each.key in first[0]],
         photometry=_PHOTOMETRY,
         outside=0 if wide is None else len(wide["candidates"]) - len(summary["candidates"]),
         deeper=depth_against_klip(summary["contrast_curve"], summary["klip_curve"]),
-        age=_age(summary["wavefront_map"]["days_before_first_frame"]),
-        map_remark=remark_on_map(summary["wavefront_map"]["days_before_first_frame"]),
+        age=_age(summary["opd"]["days_before_first_frame"]),
+        map_remark=remark_on_map(summary["opd"]["days_before_first_frame"]),
         left_out=by_reason((each["name"], each["reason"]) for each in summary["left_out"]),
         provenance=_provenance(summary),
         settings=list(_flat(summary["settings"])),
@@ -82,7 +81,7 @@ class _Column:
         return self.form(*(row[each] for each in (self.key, self.error) if each))
 
 
-_SKY = (
+_SKY_COLUMNS = (
     _Column("Mid-exposure (UTC)", str, "epoch"),
     _Column("ΔRA cos Dec (arcsec)", plus_minus, "delta_ra_arcsec", "delta_ra_error_arcsec"),
     _Column("ΔDec (arcsec)", plus_minus, "delta_dec_arcsec", "delta_dec_error_arcsec"),
@@ -115,7 +114,7 @@ def _setup(summary: Mapping[str, Any]) -> str:
 
 
 def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    fit, map_, star = summary["fit"], summary["wavefront_map"], summary["star"]
+    fit, map_, star = summary["fit"], summary["opd"], summary["star"]
     error = fit["model_error"]
     flux = []
     if star is not None:
@@ -129,8 +128,8 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
             "none needed" if error == 0 else number(error and 100 * error, ".2g", "% of the star"),
         ),
         ("Errors multiplied by", number(fit["error_factor"])),
-        ("Wavefront map", f"{map_['name']}, {_age(map_['days_before_first_frame'])}"),
-        ("Flat-field pattern", _pattern(summary["systematics"])),
+        ("OPD map", f"{map_['name']}, {_age(map_['days_before_first_frame'])}"),
+        ("Detector pattern", _pattern(summary["pattern"])),
         *flux,
     ]
 
@@ -146,7 +145,7 @@ def _chi2(value: float | None) -> str:
 
 
 def _pattern(used: Mapping[str, Any] | None) -> str:
-    """Where the flat-field pattern comes from, and how strong it is in the frames."""
+    """Where the detector pattern comes from, and how strong it is in the frames."""
     if used is None:
         return "none known"
     own, other = (", ".join(used[key]) for key in ("own_stars", "other_stars"))
@@ -177,7 +176,7 @@ def _provenance(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Chi-squared per pixel", number(summary["fit"]["chi2_per_pixel"])),
         ("Chi-squared per pixel, by separation", rings),
         ("Software", ", ".join(" ".join(each) for each in summary["versions"].items())),
-        ("SHA-256 of the wavefront map", str(summary["wavefront_map"]["sha256"])),
+        ("SHA-256 of the OPD map", str(summary["opd"]["sha256"])),
     ]
 
 
@@ -198,7 +197,7 @@ def _setting(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:g}"
-    if isinstance(value, str) or not isinstance(value, abc.Sequence):
+    if isinstance(value, str) or not isinstance(value, Sequence):
         return str(value)
     return ", ".join(_setting(each) for each in value) or "none"
 
@@ -228,7 +227,7 @@ PRODUCTS = {
     "fit.fits": "the fit, for Refinement.read",
     "detection_other.fits": "the search of the other fit, with or without reference stars",
     "fit_other.fits": "the other fit, whose limits are deeper at some separations",
-    "systematics.fits": "the flat-field pattern, for other reductions",
+    "pattern.fits": "the detector pattern, for other reductions",
 }
 """Every file that a reduction may write, with its content."""
 
@@ -298,8 +297,8 @@ def write_products(
         written += reduction.wide.write(folder, overwrite=True)
     if reduction.disk is not None:
         written.append(reduction.disk.write(folder, overwrite=True))
-    if reduction.systematics is not None:
-        written.append(reduction.systematics.write(folder / "systematics.fits", overwrite=True))
+    if reduction.pattern is not None:
+        written.append(reduction.pattern.write(folder / "pattern.fits", overwrite=True))
     tables = {"injections": reduction.injections, "completeness": reduction.completeness}
     for name, table in tables.items():
         if table is not None:

@@ -23,7 +23,7 @@ from pyklip_diffrender.reduction.products import ProductFolder, read_summary
 from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.reduction.visit import Visit
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,7 +32,7 @@ class Reduction(ReductionResult):
 
     Attributes
     ----------
-    sequence : Sequence
+    sequence : ExposureSequence
         The frames, cut to the fitted pixels.
     fit : Refinement
         The fit that was searched: all frames of the target together, with the bright candidates in
@@ -40,12 +40,12 @@ class Reduction(ReductionResult):
     detection : Detection
     references : tuple of Refinement
         One for each reference star that was fitted.
-    systematics : Systematics or None
-        The flat-field pattern that was used.
+    pattern : DetectorPattern or None
+        The detector pattern that was used.
     failed : tuple of (str, str)
         Reference stars that could not be fitted, and why.
-    pattern : str
-        Origin of the flat-field pattern, with the names of its stars.
+    pattern_origin : str
+        Origin of the detector pattern, with the names of its stars.
     visit : Visit
         What every frame of a reference star has contributed to the fit of the target.
     wide : WideField or None
@@ -61,7 +61,7 @@ class Reduction(ReductionResult):
 
     Examples
     --------
-    With frames and wavefront maps in folders, which the package does not contain:
+    With frames and OPD maps in folders, which the package does not contain:
 
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
@@ -170,7 +170,7 @@ class Reduction(ReductionResult):
             if (folder / f"{name}.ecsv").exists()
         }
         result = cls(
-            Sequence(
+            ExposureSequence(
                 about["target"],
                 tuple(each for each in frames if not each.reference),
                 tuple(each for each in frames if each.reference),
@@ -178,9 +178,9 @@ class Reduction(ReductionResult):
             ),
             fit,
             detection,
-            systematics=fit.systematics,
+            pattern=fit.pattern,
             failed=tuple((n.removeprefix(star), why) for n, why in left if n.startswith(star)),
-            pattern=about["pattern"],
+            pattern_origin=about["pattern_origin"],
             visit=Visit.from_facts(about["visit"]),
             accuracy=about["accuracy"],
             **tables,
@@ -197,7 +197,7 @@ class Reduction(ReductionResult):
         derivatives: bool = False,
         figures: Literal["pdf", "png", "svg"] | None = None,
     ) -> list[Path]:
-        """Write maps, tables, the fit, the flat-field pattern, figures and a report.
+        """Write maps, tables, the fit, the detector pattern, figures and a report.
 
         Parameters
         ----------
@@ -238,7 +238,7 @@ class Reduction(ReductionResult):
 
 
 def reduce(
-    sequence: Sequence | str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    sequence: ExposureSequence | str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     opd: Any,
     *,
     target: str | None = None,
@@ -251,20 +251,20 @@ def reduce(
 ) -> Reduction:
     """Search a sequence of real frames for planets.
 
-    The flat-field pattern, the error of the model on the detector's pixels, comes from the
+    The detector pattern, the error of the model on the detector's pixels, comes from the
     package's library or, where that has none, from fits of the sequence's reference stars. With
     it, all frames of the target are fitted together and searched.
 
     Parameters
     ----------
-    sequence : Sequence, or files as for `Sequence.from_files`
+    sequence : ExposureSequence, or files as for `ExposureSequence.from_files`
     opd : path, OPDMap, Quantity, array or "flat"
         The wavefront to start from, as for `refine`. Of a folder of maps, the one nearest in time
-        to the target's frames is taken; see `choose_map` for other rules. "flat" is for frames
+        to the target's frames is taken; see `choose_opd` for other rules. "flat" is for frames
         without a map: the fit then takes longer, and the star's flux is uncertain by 40 % unless
         `star_flux` says it.
     target, filter : str, optional
-        See `Sequence.from_files`.
+        See `ExposureSequence.from_files`.
     progress : bool
         Show progress bars.
     options : ReduceOptions, optional
@@ -288,7 +288,7 @@ def reduce(
     IncompatibleSetupError
         For options that `ReduceOptions` refuses; for `star_flux` with frames that are not
         calibrated, or that differs from the fitted flux by more than a factor of three; for
-        `systematics` of the star itself, of another filter, mask or detector, of other pixels, or
+        `pattern` of the star itself, of another filter, mask or detector, of other pixels, or
         of which the frames show less than half; and if `output` is a file.
     TypeError
         For a keyword that is no option, or keywords together with `options`.
@@ -305,7 +305,7 @@ def reduce(
 
     Examples
     --------
-    With frames and wavefront maps in folders, which the package does not contain:
+    With frames and OPD maps in folders, which the package does not contain:
 
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
@@ -317,8 +317,8 @@ def reduce(
         raise TypeError(
             f"reduce() got options and the keywords {', '.join(keywords)}, expected one of the two"
         )
-    if not isinstance(sequence, Sequence):
-        sequence = Sequence.from_files(sequence, target=target, filter=filter)
+    if not isinstance(sequence, ExposureSequence):
+        sequence = ExposureSequence.from_files(sequence, target=target, filter=filter)
     if output is None:
         if overwrite:
             raise TypeError("reduce() got overwrite without output, a folder")

@@ -29,7 +29,7 @@ SPECTRA = ("blackbody", "flat", "free")
 COMPARISON = ("comparison.html", "comparison.json")
 """Files that `write_comparison` writes."""
 
-_MOST_TRACKS = 6
+_MOST_DRAWN_TRACKS = 6
 """Largest number of candidates for which the track of a background source is drawn."""
 
 
@@ -186,7 +186,7 @@ def _tracks(combination: Combination) -> list[Picture]:
     if motion is None:
         return []
     pictures = []
-    for number in range(1, min(len(combination.candidates), _MOST_TRACKS) + 1):
+    for number in range(1, min(len(combination.candidates), _MOST_DRAWN_TRACKS) + 1):
         seen = combination.sightings[combination.sightings["candidate"] == number]
         start, first = _columns(seen, "delta_ra", "delta_dec")[0], float(seen["epoch_mjd"][0])
         drawn = []

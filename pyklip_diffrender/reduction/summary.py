@@ -25,13 +25,13 @@ from pyklip_diffrender.reduction.fit_status import advice
 from pyklip_diffrender.reduction.pages import sentence
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.refinement import FrameFit, Refinement
+from pyklip_diffrender.scene.detector_pattern import caveat
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import caveat
 
-_LIMITS = (0.5, 1.0, 1.5, 2.0)
+_LIMITS_ARCSEC = (0.5, 1.0, 1.5, 2.0)
 """Separations at which limits are stated, arcsec."""
 
-_LIBRARIES = ("torch", "numpy", "scipy", "astropy", "photutils", "matplotlib")
+_STATED_LIBRARIES = ("torch", "numpy", "scipy", "astropy", "photutils", "matplotlib")
 
 
 def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
             "message": fit.status.message,
             "advice": advice(
                 fit.status,
-                patterned=reduction.systematics is not None,
+                patterned=reduction.pattern is not None,
                 remark=f"{detection.remark} {reduction.remark}".strip(),
             ),
             "usable": fit.status.usable,
@@ -81,9 +81,9 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
             "error_factor": detection.scatter,
             "rings": plain_rows(detection.rings),
         },
-        "wavefront_map": _wavefront_map(fit, first),
-        "systematics": _systematics(reduction),
-        "pattern": reduction.pattern,
+        "opd": _opd(fit, first),
+        "pattern": _pattern(reduction),
+        "pattern_origin": reduction.pattern_origin,
         "extended": reduction.extended,
         "candidates": _candidates(reduction),
         "wide_field": None if reduction.wide is None else _wide_field(reduction.wide),
@@ -116,7 +116,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
         "versions": {
             "pyklip_diffrender": __version__,
             "python": platform.python_version(),
-            **{name: version(name) for name in _LIBRARIES},
+            **{name: version(name) for name in _STATED_LIBRARIES},
         },
     }
     summary = {"sentence": sentence(summary), **summary}
@@ -136,7 +136,7 @@ def wavefronts(fit: Refinement) -> tuple[NDArray[np.float64], NDArray[np.float64
     return before, after
 
 
-def _wavefront_map(fit: Refinement, frame: Observation) -> dict[str, Any]:
+def _opd(fit: Refinement, frame: Observation) -> dict[str, Any]:
     date, days = fit.initial.date, None
     if date is not None and frame.date is not None:
         days = frame.date.mjd - date.mjd
@@ -152,8 +152,8 @@ def _wavefront_map(fit: Refinement, frame: Observation) -> dict[str, Any]:
     }
 
 
-def _systematics(reduction: ReductionResult) -> dict[str, Any] | None:
-    used = reduction.systematics
+def _pattern(reduction: ReductionResult) -> dict[str, Any] | None:
+    used = reduction.pattern
     if used is None:
         return None
     provenance = {key: used.provenance.get(key, []) for key in ("stars", "frames")}
@@ -255,7 +255,7 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
     if not len(curve):
         return []
     separation = curve["separation"].to_value("arcsec")
-    inside = [s for s in _LIMITS if separation[0] - 1e-6 <= s <= separation[-1] + 1e-6]
+    inside = [s for s in _LIMITS_ARCSEC if separation[0] - 1e-6 <= s <= separation[-1] + 1e-6]
     rows = []
     # Limits fall by orders of magnitude with the separation: their logarithms are interpolated.
     for separation_arcsec in inside or [separation[-1]]:

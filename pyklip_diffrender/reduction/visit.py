@@ -2,7 +2,7 @@
 
 The target is fitted first. The frames of reference stars of the same visit are then aligned with
 its wavefront, and a few steps fit all frames together: with one wavefront, but for a drift from
-exposure to exposure whose size is measured, and with one flat-field pattern on the pixels of the
+exposure to exposure whose size is measured, and with one detector pattern on the pixels of the
 detector. What speaks against a frame is looked at in this order:
 
 1. Frames that the target's wavefront is far from explaining, or whose star is too faint, do not
@@ -47,22 +47,22 @@ from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
 from pyklip_diffrender.refinement import (
+    FitSettings,
     FrameFit,
-    GaussNewton,
     Refinement,
     align_frame,
     join_frames,
 )
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 _log = logging.getLogger(__name__)
 
 _SLEWS = WavefrontPrior(scales={"segment": 0.75, "texture": 0.5}, knee=1.0, slope=1.0)
 _DITHERS = WavefrontPrior(scales={"segment": 0.4, "texture": 0.25}, knee=1.0, slope=1.0)
-_CYCLES = 8.0
+_DRIFT_CYCLES = 8.0
 """Drift of the wavefront, nm, between exposures with a slew between them and between the dithers of
 one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show it, from a fourth
 of that up to 11 nm. The heaters of the instruments' electronics alone change it by 1 to 2 nm within
@@ -71,52 +71,52 @@ section 4). Modes finer than 8 cycles per pupil belong to the polished segments,
 which last; with 12 cycles, limits of a simulated visit are the same within 1 %, and take a quarter
 longer."""
 
-_TOLERANCE = 3e-4
-"""`GaussNewton.tolerance` of the joint fit: 13 units of chi-squared for seven frames."""
+_JOINT_FIT_TOLERANCE = 3e-4
+"""`FitSettings.tolerance` of the joint fit: 13 units of chi-squared for seven frames."""
 
-_ROUGH = 1e-3
-"""`GaussNewton.tolerance` of the fit of the target alone, before the joint fit."""
+_ROUGH_TOLERANCE = 1e-3
+"""`FitSettings.tolerance` of the fit of the target alone, before the joint fit."""
 
-_EXCESS = 1.5
+_CONTRADICTING_CHI2_RATIO = 1.5
 """Chi-squared per pixel of a reference frame over the target's, from which the frame contradicts
 the target."""
 
-_UNLIKE = 0.14
+_UNLIKE_STAR_RATIO = 0.14
 """Part of a star's light that the target's wavefront leaves unexplained, at 4.4 um, from which a
 frame spoils the fit of all and lets it converge slowly. In frames of stpsf whose wavefronts differ
 by 2 nm it was 0.05, between real stars hours apart 0.125, and 0.155 to 0.165 for AU Mic with its
 disk. It grows as 1 / wavelength."""
 
-_STEPS = 20
+_JOINT_FIT_STEPS = 20
 """Largest number of steps of the joint fit. Fits that converged took 7 to 12."""
 
-_FAINT = 0.05
+_FAINT_REFERENCE_FLUX_RATIO = 0.05
 """Flux of a reference star over the target's below which its frames teach nothing: their noise is
 20 times the target's, relative to the star."""
 
-_MASKED = 1.5
+_MASKED_COMPANION_LAMBDA_D = 1.5
 """Radius of the mask about a companion of a reference star, lambda/D: its core. Its side lobes are
 subtracted with the contrast that the joint fit without it leaves, three quarters or more."""
 
-_SUBTRACTED = 0.1
+_SUBTRACTED_LIGHT_ERROR = 0.1
 """Error of the light that is subtracted: a star that the wavefront of another one explains
-is 0.05 to 0.13 off, see `_UNLIKE`."""
+is 0.05 to 0.13 off, see `_UNLIKE_STAR_RATIO`."""
 
-_ROUNDS = 4
+_MOST_JOINT_FITS = 4
 """Largest number of joint fits, with companions masked and frames left out one after another."""
 
 _SEPARATIONS = (0.4, 0.55, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0)
 """arcsec at which limits with and without the references are compared."""
 
-_ANGLES = 6
+_POSITIONS_PER_SEPARATION = 6
 """Positions at each of them."""
 
-_SHOWN = 12.0
+_JOINT_COMPANION_SNR = 12.0
 """S/N of a candidate in the target's frames alone above which all candidates are companions of the
 joint fit. Candidates above 25 in all frames would have it refined again, for half of its time,
 and the references make the S/N up to twice as large."""
 
-_FRAME = 2.2
+_FRAME_RATIO = 2.2
 """Memory for one more frame, relative to the derivatives of its pixels by all unknowns."""
 
 
@@ -188,7 +188,7 @@ class Visit:
                 f"{' ' + self.where if self.where else ''}"
             )
         if counts["pattern"]:
-            parts.append(f"{counts['pattern']} for the flat-field pattern")
+            parts.append(f"{counts['pattern']} for the detector pattern")
         if counts["not used"]:
             reasons = dict.fromkeys(each.reason for each in self.unused)
             parts.append(f"{counts['not used']} not used by the fit: {'; '.join(reasons)}")
@@ -213,9 +213,9 @@ class Joined(NamedTuple):
     detection: Detection | None = None  # its search, if there was one
 
 
-def rough_settings(settings: GaussNewton) -> GaussNewton:
+def rough_settings(settings: FitSettings) -> FitSettings:
     """Settings of a fit of the target from which the fit of all frames goes on."""
-    return replace(settings, tolerance=max(settings.tolerance, _ROUGH), adapt_prior=False)
+    return replace(settings, tolerance=max(settings.tolerance, _ROUGH_TOLERANCE), adapt_prior=False)
 
 
 def with_references(
@@ -242,11 +242,11 @@ def with_references(
         fit.settings,
         drift=fit.settings.drift or _SLEWS,
         dither_drift=_DITHERS,
-        drift_cycles=_CYCLES,
-        tolerance=max(fit.settings.tolerance, _TOLERANCE),
+        drift_cycles=_DRIFT_CYCLES,
+        tolerance=max(fit.settings.tolerance, _JOINT_FIT_TOLERANCE),
         adapt_prior=True,
         marginal_flux=True,
-        max_iterations=min(fit.settings.max_iterations, _STEPS),
+        max_iterations=min(fit.settings.max_iterations, _JOINT_FIT_STEPS),
     )
     if pattern is not None:
         settings = with_known_pattern(settings)
@@ -257,7 +257,7 @@ def with_references(
     with stage("reference stars and target together"):
         # Each round masks the companions that the joint fit shows, or else leaves out the frames
         # that it does not explain, until there are neither.
-        for _ in range(_ROUNDS):
+        for _ in range(_MOST_JOINT_FITS):
             joint = None
             if not used:
                 break
@@ -266,7 +266,7 @@ def with_references(
                 if not used:
                     break
                 joint = join_frames(
-                    fit, aligned, settings, systematics=pattern, companions=companions,
+                    fit, aligned, settings, pattern=pattern, companions=companions,
                     progress=progress,
                 )  # fmt: skip
             except DiffrenderError as error:
@@ -341,7 +341,7 @@ def _companions(fit: Refinement, alone: Detection | None) -> tuple[Planet, ...]:
     if alone is None and fit.status.calibrated:
         # It is not refined with them: that is left to the fit of all frames.
         alone = detect(fit, relinearise=math.inf)
-    if alone is None or not (np.asarray(alone.candidates["snr"]) > _SHOWN).any():
+    if alone is None or not (np.asarray(alone.candidates["snr"]) > _JOINT_COMPANION_SNR).any():
         return fit.planets
     return alone.sources.planets()
 
@@ -355,10 +355,10 @@ def _that_fit_into(
     """As many frames as the memory allows, those nearest in time to the target first."""
     if memory is None:
         return list(references)
-    # A frame's derivatives are in single precision, four bytes each, and it takes `_FRAME` times
-    # them.
+    # A frame's derivatives are in single precision, four bytes each, and it takes `_FRAME_RATIO`
+    # times them.
     derivatives = 4.0 * fit.linear.frames[0].jacobian.numel()
-    spare = fit.settings.memory_beside(len(fit.frames) * derivatives) / (_FRAME * derivatives)
+    spare = fit.settings.memory_beside(len(fit.frames) * derivatives) / (_FRAME_RATIO * derivatives)
     date = fit.frames[0].observation.date
 
     def days(each: Observation) -> float:
@@ -375,8 +375,8 @@ def _that_fit_into(
 def _aligned(
     fit: Refinement,
     references: Sequence[Observation],
-    settings: GaussNewton,
-    pattern: Systematics | None,
+    settings: FitSettings,
+    pattern: DetectorPattern | None,
     left_out: dict[str, str],
     remarks: dict[str, str],
 ) -> tuple[list[Observation], list[Refinement]]:
@@ -385,17 +385,17 @@ def _aligned(
     A bright companion of a reference star is subtracted from its frames and masked.
     """
     wavelength = float(np.mean(fit.model.bandpass.wavelengths))
-    limit = _UNLIKE * 4.4e-6 / wavelength
+    limit = _UNLIKE_STAR_RATIO * 4.4e-6 / wavelength
     observations, aligned = [], []
     for each in references:
-        one = align_frame(fit, each, settings, systematics=pattern)
+        one = align_frame(fit, each, settings, pattern=pattern)
         brightness = one.frames[0].flux / fit.frames[0].flux
         unexplained = _unexplained(one)
-        if brightness >= _FAINT and unexplained > limit:
+        if brightness >= _FAINT_REFERENCE_FLUX_RATIO and unexplained > limit:
             each, one = _with_bright_companion(fit, each, one, settings, pattern, limit, remarks)
             unexplained = _unexplained(one)
         reason = ""
-        if brightness < _FAINT:
+        if brightness < _FAINT_REFERENCE_FLUX_RATIO:
             reason = f"its star has {brightness:.2g} of the target's flux"
         elif unexplained > limit:
             reason = (
@@ -416,8 +416,8 @@ def _with_bright_companion(
     fit: Refinement,
     observation: Observation,
     alone: Refinement,
-    settings: GaussNewton,
-    pattern: Systematics | None,
+    settings: FitSettings,
+    pattern: DetectorPattern | None,
     limit: float,
     remarks: dict[str, str],
 ) -> tuple[Observation, Refinement]:
@@ -425,13 +425,13 @@ def _with_bright_companion(
 
     If there is none, these are the frame and the fit as they were.
     """
-    both = align_frame(fit, observation, settings, systematics=pattern, companions=1)
+    both = align_frame(fit, observation, settings, pattern=pattern, companions=1)
     if not len(both.companions) or _unexplained(both) > limit:
         return observation, alone
     (frame,), ((contrast, x, y),) = both.frames, both.companions.tolist()
     source = ReferenceSource(contrast, (x, y), frame.companion_image)
     without = _subtracted(observation, frame, source, remarks)
-    return without, align_frame(fit, without, settings, systematics=pattern)
+    return without, align_frame(fit, without, settings, pattern=pattern)
 
 
 def _subtracted(
@@ -443,7 +443,7 @@ def _subtracted(
     """
     x, y = source.offset
     away = np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y)
-    near = away < _MASKED * frame.model.resolution
+    near = away < _MASKED_COMPANION_LAMBDA_D * frame.model.resolution
     # It was subtracted and masked in an earlier round.
     if not (observation.valid & near).any():
         return observation
@@ -457,7 +457,7 @@ def _subtracted(
     return replace(
         observation,
         data=observation.data - source.light,
-        error=np.hypot(observation.error, _SUBTRACTED * source.light),
+        error=np.hypot(observation.error, _SUBTRACTED_LIGHT_ERROR * source.light),
         valid=observation.valid & ~near,
     )
 
@@ -487,10 +487,10 @@ def _frame_chi2(fit: Refinement) -> NDArray[np.float64]:
     for frame in fit.frames:
         observation = frame.observation.combined()
         valid, noise = observation.valid[0], observation.error[0]
-        if fit.systematics is not None:
+        if fit.pattern is not None:
             light = frame.star - frame.values["background"][0] + frame.pedestal
             # The pattern's error multiplies star and pedestal, as the pattern does.
-            noise = np.hypot(noise, fit.systematics.at(observation)[1] * light)
+            noise = np.hypot(noise, fit.pattern.at(observation)[1] * light)
         residual = observation.data[0] - frame.star - frame.companion_image
         values.append(float(np.mean((residual / noise)[valid] ** 2)))
     return np.array(values)
@@ -502,7 +502,7 @@ def _contradicting(joint: Refinement, science: int) -> dict[str, str]:
     # A frame that is far from the others spoils the fit of all. Those that are half as far are not
     # blamed yet: the next joint fit, without the worst, shows whether they were.
     usual = max(1.0, float(np.median(values[:science])))
-    limit = max(_EXCESS * usual, values[science:].max() / 2)
+    limit = max(_CONTRADICTING_CHI2_RATIO * usual, values[science:].max() / 2)
     reasons = {}
     for k, frame in enumerate(joint.frames[science:], science):
         name = frame.observation.name
@@ -535,11 +535,11 @@ def _gain(alone: Refinement, joint: Refinement) -> float:
 
 
 def _flux_errors(fit: Refinement) -> NDArray[np.float64]:
-    """Errors of the fluxes of point sources, the medians of `_ANGLES` places at each separation."""
+    """Errors of the fluxes of point sources, medians of the positions at each separation."""
     # Errors of contrasts cannot be compared: the fits may differ in the flux of the star.
     groups, edge = groups_of([fit]), float(np.abs(fit.frames[0].grid).max())
     separations = [each for each in _SEPARATIONS if each < edge] or [edge / 2]
-    rings = ring_pixels(groups[0][1].grid, np.array(separations), _ANGLES)
+    rings = ring_pixels(groups[0][1].grid, np.array(separations), _POSITIONS_PER_SEPARATION)
     rows, columns = np.concatenate(rings, axis=1)
     products = weigh(groups, lambda templates: templates.at_pixels(rows, columns))
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]

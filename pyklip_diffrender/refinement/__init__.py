@@ -16,7 +16,7 @@ from pyklip_diffrender.refinement.fitting import (
     with_star_flux,
 )
 from pyklip_diffrender.refinement.settings import (
-    GaussNewton,
+    FitSettings,
     coarse_arguments,
     faintness,
     nircam_settings,
@@ -25,8 +25,8 @@ from pyklip_diffrender.refinement.settings import (
 )
 
 __all__ = [
+    "FitSettings",
     "FrameFit",
-    "GaussNewton",
     "Refinement",
     "Status",
     "align_frame",

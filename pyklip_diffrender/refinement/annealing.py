@@ -42,7 +42,7 @@ from pyklip_diffrender.refinement.residual import (
     isolated_outliers,
     with_dominant,
 )
-from pyklip_diffrender.refinement.settings import GaussNewton, ModePriors, count_modes_below
+from pyklip_diffrender.refinement.settings import FitSettings, ModePriors, count_modes_below
 from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.refinement.unknowns import brightest
 from pyklip_diffrender.scene.objects import Planet
@@ -51,7 +51,7 @@ from pyklip_diffrender.wavefront.priors import EvidenceUpdate
 
 # The course of a fit: its states, and how far it has come.
 
-_ROUNDS = 6
+_BAD_PIXEL_STATES = 6
 """Largest number of states at which bad pixels are searched."""
 
 NOTHING = (math.inf, math.inf)
@@ -67,7 +67,7 @@ class Course:
     aligned: State  # The state at the end of the alignment.
     carried: StepState  # What the last step hands on to the next one.
     # Settings of the fit, with the size of the drift between frames once it is measured.
-    settings: GaussNewton
+    settings: FitSettings
     kappa: float  # Model error that the next step assumes.
     modes: int  # Number of leading wavefront modes that are free; 0 for the alignment.
     remaining: int  # Number of steps that may follow.
@@ -77,7 +77,7 @@ class Course:
     # Companions may not be dropped after some were added to a fit that had stalled, or it might add
     # and drop them for ever.
     may_drop: bool = True
-    outlier_searches: int = _ROUNDS  # Number of searches for bad pixels that may follow.
+    outlier_searches: int = _BAD_PIXEL_STATES  # Number of searches for bad pixels that may follow.
     may_settle: bool = True  # Whether the priors have not been measured near the solution.
 
 
@@ -112,7 +112,7 @@ def derivatives_of(
 
 def conclude(
     solver: Solver,
-    settings: GaussNewton,
+    settings: FitSettings,
     priors: ModePriors,
     state: State,
     kappa: float,
@@ -140,7 +140,7 @@ def conclude(
         unknowns = point.unknowns
         own = deviation[state.unknowns.rows[k].rows[: len(linear.frames[k].rows)]]
         values = {n: v.cpu().numpy() for n, v in unknowns.values(point.vector).items()}
-        levels = ("flux", "background", *(["pedestal"] if problem.systematics else []))
+        levels = ("flux", "background", *(["pedestal"] if problem.pattern else []))
         for name in levels:
             values[name] = unknowns.start[name].numpy()
         errors = {name: math.nan * value for name, value in values.items()}
@@ -178,7 +178,7 @@ def conclude(
         effective_parameters=update.effective,
         log_evidence=update.log_evidence,
         stored_linear=linear,
-        systematics=problems[0].systematics,
+        pattern=problems[0].pattern,
         **about,
     )
 
@@ -187,97 +187,97 @@ def conclude(
 
 _log = logging.getLogger(__name__)
 
-_EXPLAINED = 1.2
+_EXPLAINED_CHI2 = 1.2
 """Chi-squared per pixel below which the noise explains the residual."""
 
-_NEGLIGIBLE = 1e-3
+_LAST_MODEL_ERROR = 1e-3
 """Model error, as a fraction of the star, below which annealing ends."""
 
-_COARSE = 0.01
+_FEW_MODES_MODEL_ERROR = 0.01
 """Model error above which modes up to `_FEW_CYCLES` are sufficient."""
 
 _FEW_CYCLES = 14.0
 
-_NEAR = 0.003
+_NEW_COMPANION_MODEL_ERROR = 0.003
 """Model error below which a new companion has hardly biased the wavefront.
 
 Planets of contrast 5e-7 to 2e-6 were found at a model error of 0.001 to 0.0026. Side lobes of a
 planet of contrast 1e-4 at 0.3 arcsec were mistaken for planets at 0.005 to 0.1.
 """
 
-_BRIGHT = 8.0
+_STALLED_COMPANION_SNR = 8.0
 """S/N, in units of the scatter, above which a companion is added when the wavefront's fit stalls.
 
 Without companions, peaks reached 6 (drifts of 40 to 400 h). Companions that stalled a fit had 12.
 """
 
-_FIELD = 7.0
-_OUTER = 0.7
+_FIELD_COMPANION_SNR = 7.0
+_FIELD_COMPANION_ARCSEC = 0.7
 """S/N and separation, arcsec, of further companions that are added to an aligned star. In pairs of
 real rolls, peaks reached 9 within 0.6 arcsec and 5 beyond; two neighbours of 1e-3 of the star's
 flux had 34 and 17, and the last of ten that are added in a crowded field 9."""
 
-_HOPELESS = 0.12
+_SOURCES_MODEL_ERROR = 0.12
 """Model error, as a fraction of the star, that only sources leave where the wavefront is free. The
 disk of AU Mic leaves 0.11 at most, and ten neighbours up to 8e-4 of the star's flux 0.15 to 0.3."""
 
-_FAINT = 5.0
+_DROPPED_COMPANION_SNR = 5.0
 """S/N below which the last steps of a fit leave out a companion; candidates have as much. Errors
 of the wavefront had an S/N below 1 in real frames."""
 
-_MOST_BRIGHT = 20
+_MOST_ADDED_COMPANIONS = 20
 """Largest number of bright companions that a fit may add."""
 
-_ALIGNED = 0.05
+_ALIGNED_CHI2_GAIN = 0.05
 """Gain in chi-squared per pixel below which the wavefront is fitted as well."""
 
-_OUTSHONE = 1.0
+_OUTSHONE_MODEL_ERROR = 1.0
 """Model error, as a fraction of the star, from which something may outshine the star."""
 
-_STALLED = 0.01
+_STALLED_CHI2_GAIN = 0.01
 """Gain of a step in chi-squared per pixel below which bad pixels are looked for. An unflagged bad
 pixel can keep the model error at 3 %, and the fit would take six more steps that gain nothing."""
 
-_SPOILED = 0.01
+_RESTART_MODEL_ERROR = 0.01
 """Model error from which a fit goes back to the alignment after bad pixels were left out, if these
 pixels made more than half of chi-squared."""
 
-_ANNEALING = 0.6
+_KAPPA_STEP_RATIO = 0.6
 """Largest ratio of kappa in successive steps."""
 
-_SEARCHES = 6
+_BAD_PIXEL_SEARCHES = 6
 """Largest number of searches for bad pixels at one state: a bright one hides fainter ones beside
 it."""
 
-_STEPS = 4
+_CONTINUED_STEPS = 4
 """Largest number of steps after pixels were left out or the noise has changed, which both do little
 to a fit with robust weights."""
 
 _COMPANION_STEPS = 4
 """Largest number of steps that fit a new companion alone."""
 
-_WIDENINGS = 3
+_MOST_WIDENINGS = 3
 """Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
 
 _FOREIGN = 2.0
 """Chi-squared per pixel above which frames show more than a star, such as a disk, which a wider
 prior would take for an error of the wavefront."""
 
-_NARROW = 0.8
+_NARROWED_SIZE_RATIO = 0.8
 """Size of the fitted wavefront, relative to its prior, below which the prior is narrowed."""
 
-_NARROWINGS = 3
+_MOST_NARROWINGS = 3
 _SOLUTIONS = 8
 _SAME_SIZE = 0.05
-_LEAST_SLOPE = 0.2
+_SIZE_SLOPE = 0.2
 """Largest number of times that a prior is narrowed; largest number of solutions of a linear model
 from which the size of the wavefront follows; negligible logarithm of that size; and least change of
 the logarithm that is believed, relative to the change of the scale."""
 
-_MODES = ("amplitude", "modes", "drift")
+_PRIOR_NAMES = ("amplitude", "modes", "drift")
 """Names of the unknowns that have a prior of `ModePriors`."""
 
-_EARLY = 1
+_PRIOR_MEASURED_AFTER_STEPS = 1
 """Number of steps of a fit that continues another one, after which the sizes of the wavefront and
 of the drift between frames are measured for the first time."""
 
@@ -296,7 +296,7 @@ class _Fitted:
 
     state: State
     carried: StepState
-    settings: GaussNewton
+    settings: FitSettings
 
 
 # How the model error decreases. With the data d, the star s, and the noise sigma of a pixel, the
@@ -311,8 +311,9 @@ class _Fitted:
 #     kappa' = min(0.6 kappa, e / 2),
 #
 # half the error that is left, so that the next step aims at explaining more than the last one did,
-# and at most `_ANNEALING` times the last kappa, so that it ends even where e no longer decreases.
-# A kappa below `_NEGLIGIBLE` is 0 (or `min_model_error`): the noise is then the photons' own.
+# and at most `_KAPPA_STEP_RATIO` times the last kappa, so that it ends even where e no longer
+# decreases. A kappa below `_LAST_MODEL_ERROR` is 0 (or `min_model_error`): the noise is then the
+# photons' own.
 
 
 class Annealing:
@@ -325,7 +326,7 @@ class Annealing:
     def __init__(
         self,
         problems: Sequence[Problem],
-        settings: GaussNewton,
+        settings: FitSettings,
         basis: Basis,
         warm: Mapping[Unknown, float] | None,
         progress: bool,
@@ -352,7 +353,7 @@ class Annealing:
             adapted = earlier.settings.adapt_prior or not settings.adapt_prior
             self._has_scales = earlier.status.calibrated and adapted
             if settings.marginal_flux and earlier.settings.marginal_flux:
-                others = sum(each.name not in _MODES for each in earlier.linear.unknowns)
+                others = sum(each.name not in _PRIOR_NAMES for each in earlier.linear.unknowns)
                 determined = max(0.0, earlier.effective_parameters - others)
                 priors = replace(self._first.priors, determined=determined)
                 self._first = replace(self._first, priors=priors)
@@ -416,11 +417,11 @@ class Annealing:
         """Choose what follows a step of the alignment; True if the fit has converged."""
         floor = self.settings.min_model_error
         course.kappa = max(floor, min(course.kappa, course.error))
-        bright = self._significant(course) if gain < _ALIGNED else []
+        bright = self._significant(course) if gain < _ALIGNED_CHI2_GAIN else []
         if bright:
             course.state = self._with_companions(course.state, bright)
             return False
-        if gain < _ALIGNED and self.settings.wavefront:
+        if gain < _ALIGNED_CHI2_GAIN and self.settings.wavefront:
             course.aligned, course.modes = course.state, self._modes_for(course.kappa)
             # The damping of the alignment does not apply to the wavefront.
             course.carried = course.carried.without_damping()
@@ -430,12 +431,12 @@ class Annealing:
     def _anneal(self, course: Course, gain: float) -> bool:
         """Choose what follows a step of the wavefront; True if the fit has converged."""
         floor = self.settings.min_model_error
-        stalled = course.error > max(course.kappa, _NEGLIGIBLE)
+        stalled = course.error > max(course.kappa, _LAST_MODEL_ERROR)
         bright = self._stalling(course) if stalled else []
         if bright:
             self._restart(course, bright)
             return False
-        if stalled and gain < _STALLED and course.outlier_searches:
+        if stalled and gain < _STALLED_CHI2_GAIN and course.outlier_searches:
             self._go_on_without_outliers(course)
             if not course.modes:
                 return False
@@ -444,8 +445,8 @@ class Annealing:
             return False
         if gain < self.settings.tolerance and is_last:
             return True
-        course.kappa = min(_ANNEALING * course.kappa, course.error / 2)
-        if course.kappa < max(_NEGLIGIBLE, floor):
+        course.kappa = min(_KAPPA_STEP_RATIO * course.kappa, course.error / 2)
+        if course.kappa < max(_LAST_MODEL_ERROR, floor):
             course.kappa = floor
         course.modes = self._modes_for(course.kappa)
         return False
@@ -459,14 +460,14 @@ class Annealing:
         course.least, course.error = NOTHING, self.objective.model_error(course.state)
         # The wavefront was fitted to a very bad pixel.
         fewer = self.objective.chi2_per_pixel(course.state) < course.chi2 / 2
-        if fewer and course.error > _SPOILED:
+        if fewer and course.error > _RESTART_MODEL_ERROR:
             self._back_to_alignment(course, course.aligned)
             course.remaining = self.settings.max_iterations
         course.best = course.state
 
     def _restart(self, course: Course, added: Sequence[Planet]) -> None:
         """Go on with more companions: from here near the solution, else from the alignment."""
-        is_close = course.error < _NEAR
+        is_close = course.error < _NEW_COMPANION_MODEL_ERROR
         course.least, course.remaining = NOTHING, self.settings.max_iterations
         course.may_drop, course.carried = False, course.carried.without_damping()
         if is_close:
@@ -495,14 +496,14 @@ class Annealing:
 
         Faint companions would double the time of every step, and the search finds them anyway.
         """
-        is_close = course.error <= max(_NEAR, self.settings.min_model_error)
+        is_close = course.error <= max(_NEW_COMPANION_MODEL_ERROR, self.settings.min_model_error)
         first, present = (
             len(each.unknowns.frames[0].companions) for each in (self._begin, course.state)
         )
         if not (course.may_drop and is_close and present > first):
             return False
         snr = self.solver.companion_snr(course.state, course.carried.priors)
-        faint = snr < _FAINT
+        faint = snr < _DROPPED_COMPANION_SNR
         faint[:first] = False
         if not bool(faint.any()):
             return False
@@ -528,20 +529,20 @@ class Annealing:
             return best, Status.DIVERGED
         if not converged:
             return best, Status.ITERATION_LIMIT
-        explained = self.objective.chi2_per_pixel(best.state) < _EXPLAINED
+        explained = self.objective.chi2_per_pixel(best.state) < _EXPLAINED_CHI2
         return best, Status.CONVERGED if explained else Status.MODEL_MISMATCH
 
     def _without_outliers(self, end: _Fitted) -> _Fitted:
         """Leave out bad pixels that stand alone, and go on without them."""
-        for _ in range(_ROUNDS):
+        for _ in range(_BAD_PIXEL_STATES):
             if not self._leave_out_outliers(end, self._all_modes):
                 break
-            end = self._gone_on(end, _STEPS)
+            end = self._gone_on(end, _CONTINUED_STEPS)
         return end
 
     def _with_wider_prior(self, end: _Fitted) -> _Fitted:
         """Raise the scales of a prior that is too narrow, and go on with them."""
-        for _ in range(_WIDENINGS):
+        for _ in range(_MOST_WIDENINGS):
             settings = self._widened(end)
             if settings is end.settings:
                 break
@@ -549,7 +550,7 @@ class Annealing:
             end = self._without_outliers(self._gone_on(end, self.settings.max_iterations))
         return end
 
-    def _widened(self, end: _Fitted) -> GaussNewton:
+    def _widened(self, end: _Fitted) -> FitSettings:
         """Settings with the prior of highest evidence if wider, else the settings of `end`."""
         settings, priors = end.settings, end.carried.priors
         if self.objective.chi2_per_pixel(end.state) > _FOREIGN:
@@ -573,9 +574,9 @@ class Annealing:
 
         The sizes of the wavefront and its drift change the solution more than the last steps do.
         """
-        if len(self.history) == _EARLY:
+        if len(self.history) == _PRIOR_MEASURED_AFTER_STEPS:
             self._measure_priors(course)
-        elif course.may_settle and course.modes and gain < _STALLED:
+        elif course.may_settle and course.modes and gain < _STALLED_CHI2_GAIN:
             course.may_settle = False
             if course.outlier_searches:
                 self._go_on_without_outliers(course)
@@ -597,14 +598,14 @@ class Annealing:
 
     def _with_narrower_prior(self, end: _Fitted) -> _Fitted:
         """Lower the scales of a prior that is too wide, and go on with them."""
-        for _ in range(_NARROWINGS):
+        for _ in range(_MOST_NARROWINGS):
             settings = self._narrowed(end)
             if settings is end.settings:
                 break
             end = self._gone_on(self._with_settings(end, settings), self.settings.max_iterations)
         return end
 
-    def _narrowed(self, end: _Fitted) -> GaussNewton:
+    def _narrowed(self, end: _Fitted) -> FitSettings:
         """Settings with the prior of highest evidence if narrower, else the settings of `end`."""
         # The most probable wavefront and flux are found together. Where the prior is too wide, the
         # likelihood leaves the wavefront free to be smaller, which the prior favours, and the flux
@@ -618,7 +619,7 @@ class Annealing:
             return settings
         update = self._posterior(end)
         size = priors.size(update)
-        if size > _NARROW:
+        if size > _NARROWED_SIZE_RATIO:
             return settings
         # The logarithm of the size is nearly linear in the logarithm of the prior's scale, so that
         # the last two solutions say where it is 0 (secant method).
@@ -632,7 +633,7 @@ class Annealing:
             last, log_size = log_size, math.log(priors.size(update))
             if abs(log_size) < _SAME_SIZE:
                 break
-            slope = min(1.0, max(_LEAST_SLOPE, (last - log_size) / change))
+            slope = min(1.0, max(_SIZE_SLOPE, (last - log_size) / change))
         _log.info("the wavefront is smaller than its prior says, which is now %s", settings.prior)
         return settings
 
@@ -675,12 +676,12 @@ class Annealing:
         self.solver.linear_model(end.state, priors, kappa, self._all_modes, math.inf, final=False)
         return self.solver.posterior(end.state, priors)
 
-    def _with_settings(self, end: _Fitted, settings: GaussNewton) -> _Fitted:
+    def _with_settings(self, end: _Fitted, settings: FitSettings) -> _Fitted:
         """State of a fit with other settings, and the priors that these state."""
         priors = self._priors_of(settings, end.carried.priors)
         return replace(end, carried=replace(end.carried, priors=priors), settings=settings)
 
-    def _priors_of(self, settings: GaussNewton, before: ModePriors) -> ModePriors:
+    def _priors_of(self, settings: FitSettings, before: ModePriors) -> ModePriors:
         """The priors of other settings, with the number of modes of the priors `before`."""
         return replace(self.solver.priors_of(settings), determined=before.determined)
 
@@ -709,7 +710,7 @@ class Annealing:
         The fit has adapted the first `modes` modes of the wavefront.
         """
         state, priors = end.state, end.carried.priors
-        for k in range(_SEARCHES):
+        for k in range(_BAD_PIXEL_SEARCHES):
             kappa = self._unexplained(state)
             linear = self.solver.linear_model(state, priors, kappa, modes, math.inf, final=False)
             outliers = isolated_outliers(self.objective, state, linear)
@@ -725,7 +726,7 @@ class Annealing:
 
     def _unexplained(self, state: State) -> float:
         """The model error, as a fraction of the star, if the noise does not explain the data."""
-        explained = self.objective.chi2_per_pixel(state) < _EXPLAINED
+        explained = self.objective.chi2_per_pixel(state) < _EXPLAINED_CHI2
         return 0.0 if explained else self.objective.model_error(state)
 
     def _record(
@@ -751,7 +752,7 @@ class Annealing:
         """Number of leading modes to fit while the model error is kappa."""
         joint_fit = len(self.problems) > 1
         amplitude = len(self._first.priors.amplitude) > 0
-        fine = kappa <= max(_COARSE, self.settings.min_model_error)
+        fine = kappa <= max(_FEW_MODES_MODEL_ERROR, self.settings.min_model_error)
         return len(self.basis) if fine or joint_fit or amplitude else self._few_modes
 
     @property
@@ -770,9 +771,9 @@ class Annealing:
         if most < 1 and self._may_add and self.settings.wavefront:
             # Brighter than all that the wavefront can have left. In real frames, peaks near the
             # star are errors of the model.
-            most, threshold = min(1, most + _MOST_BRIGHT), _BRIGHT
+            most, threshold = min(1, most + _MOST_ADDED_COMPANIONS), _STALLED_COMPANION_SNR
             if not self.settings.companions_if_stalled:
-                threshold, inner = _FIELD, _OUTER
+                threshold, inner = _FIELD_COMPANION_SNR, _FIELD_COMPANION_ARCSEC
         return bright_companions(
             self.objective, course.state, course.kappa, most=most, threshold=threshold, inner=inner
         )
@@ -783,12 +784,12 @@ class Annealing:
         Without this companion the star's flux would follow the companion's light.
         """
         error = self.objective.model_error(state)
-        if error < _OUTSHONE or self._is_warm or not self._may_add:
+        if error < _OUTSHONE_MODEL_ERROR or self._is_warm or not self._may_add:
             return state, carried
         # A star that is not aligned yet is as wrong.
         steps = len(self.history)
         alone, _ = self._settled(state, carried, _COMPANION_STEPS, modes=0)
-        if self.objective.model_error(alone) < _OUTSHONE:
+        if self.objective.model_error(alone) < _OUTSHONE_MODEL_ERROR:
             del self.history[steps:]
             return state, carried
         trial = with_dominant(self.objective, state, error)
@@ -805,12 +806,12 @@ class Annealing:
 
         Companions come one at a time, because side lobes of a bright companion are peaks as well.
         """
-        is_hopeless = self._may_add and course.error > _HOPELESS
+        is_hopeless = self._may_add and course.error > _SOURCES_MODEL_ERROR
         if not (self.settings.companions_if_stalled or is_hopeless):
             return []
-        most = min(1, self._room(course) + _MOST_BRIGHT)
+        most = min(1, self._room(course) + _MOST_ADDED_COMPANIONS)
         return bright_companions(
-            self.objective, course.state, course.error, most=most, threshold=_BRIGHT
+            self.objective, course.state, course.error, most=most, threshold=_STALLED_COMPANION_SNR
         )
 
     def _with_companions(self, state: State, added: Sequence[Planet]) -> State:

@@ -26,13 +26,13 @@ from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearFrame, LinearModel, Unknown
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.settings import FitSettings
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-_DATACLASSES = {each.__name__: each for each in (GaussNewton, WavefrontPrior, Planet)}
+_DATACLASSES = {each.__name__: each for each in (FitSettings, WavefrontPrior, Planet)}
 _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 
 

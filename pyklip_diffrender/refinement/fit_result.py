@@ -43,12 +43,12 @@ from pyklip_diffrender.refinement.fit_file import (
     text_hdu,
 )
 from pyklip_diffrender.refinement.forward import pixel_grid
-from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.settings import FitSettings
 from pyklip_diffrender.refinement.unknowns import brightest
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import ccd_data, primary_hdu, world_coordinates
-from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
@@ -106,7 +106,7 @@ class Status(Enum):
 
 WHAT_TO_CHECK = (
     "Check the star's position in the header (STARCENX/Y, else CRPIX1/2), the filter, the masks "
-    "and the errors, and the unit, the orientation and the date of the wavefront map."
+    "and the errors, and the unit, the orientation and the date of the OPD map."
 )
 
 
@@ -150,7 +150,7 @@ class FrameFit:
         Every parameter but the wavefront and its standard deviation (NaN where it was not
         fitted), in the units of the parameter table.
     gain : ndarray, (ny, nx)
-        Known flat-field pattern, which multiplies the star; 1 without systematics.
+        Known detector pattern, which multiplies the star; 1 without a pattern.
     coefficients : ndarray, (modes,)
         Coefficients of the wavefront modes, nm.
     """
@@ -244,7 +244,7 @@ class FrameFit:
         Returns
         -------
         ndarray, (ny, nx)
-            Image in the unit of the observation, without the flat-field pattern.
+            Image in the unit of the observation, without the detector pattern.
         """
         model, values = self.on_pixels(fov_pixels, center)
         if source is not None:
@@ -391,12 +391,12 @@ class Refinement:
         The star in each observation, in the same order.
     initial : OPDMap
         Starting wavefront.
-    settings : GaussNewton
+    settings : FitSettings
     basis : Basis
         Wavefront modes that were fitted.
     status : Status
     chi2_per_pixel : float
-        Chi-squared per pixel, with the errors of the observations and of `systematics`.
+        Chi-squared per pixel, with the errors of the observations and of `pattern`.
     model_error : float
         Assumed error of the star model, as a fraction of the star's light in a pixel, added in
         quadrature to the noise; 0 if chi-squared per pixel is near 1.
@@ -414,8 +414,8 @@ class Refinement:
     log_evidence : float
         Logarithm of the evidence of the linearised model, up to a constant of the data. Differences
         compare priors.
-    systematics : Systematics or None
-        Assumed flat-field pattern.
+    pattern : DetectorPattern or None
+        Assumed detector pattern.
     stored_linear : LinearModel or None
         The linear model; None if the fit was read from a file without it.
     history : list of dict
@@ -430,9 +430,9 @@ class Refinement:
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
+    >>> fit = dr.refine(model, frame, opd, settings=dr.FitSettings(cycles=6))
     >>> fit.status.usable
     True
     >>> fit.frames[0].star.shape
@@ -446,7 +446,7 @@ class Refinement:
 
     frames: tuple[FrameFit, ...]
     initial: OPDMap
-    settings: GaussNewton
+    settings: FitSettings
     status: Status
     chi2_per_pixel: float
     basis: Basis
@@ -458,7 +458,7 @@ class Refinement:
     prior_ratios: dict[str, float] = field(default_factory=dict)
     effective_parameters: float = math.nan
     log_evidence: float = math.nan
-    systematics: Systematics | None = None
+    pattern: DetectorPattern | None = None
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = math.nan
     catalogue_error: float | None = None
@@ -483,8 +483,8 @@ class Refinement:
                 "Frames": ", ".join(frame.observation.name for frame in self.frames),
                 "Chi-squared per pixel": f"{self.chi2_per_pixel:.3g}",
                 "Model error": f"{100 * self.model_error:.2g} % of the star",
-                "Wavefront map": self.initial.name,
-                "Systematics": None if self.systematics is None else self.systematics.name,
+                "OPD map": self.initial.name,
+                "Detector pattern": None if self.pattern is None else self.pattern.name,
                 "Companions in the fit": len(self.companions) or None,
                 "Time": f"{self.seconds:.1f} s",
             },
@@ -580,12 +580,12 @@ class Refinement:
         """Write the refinement to a FITS file that `read` reads.
 
         Extensions are the table PARAMETERS (frame, name, value, error, unit, description), the
-        starting map INITIAL_OPD (m), PATTERN and PATTERN_ERROR of the systematics that were used,
-        and for each frame, numbered by EXTVER from 1:
+        starting map INITIAL_OPD (m), PATTERN and PATTERN_ERROR of the detector pattern that was
+        used, and for each frame, numbered by EXTVER from 1:
 
         - DATA, ERROR, VALID: the observation, its integrations averaged;
         - STAR, COMPANIONS: the fitted star and background, and the light of fitted companions;
-        - GAIN: factor of the star, 1 without systematics;
+        - GAIN: factor of the star, 1 without a pattern;
         - OPD, ABSORPTION: refined wavefront and, if the pupil's amplitude was free, absorption, m;
         - COEFFICIENTS: of the wavefront modes, nm.
 
@@ -622,8 +622,8 @@ class Refinement:
             hdus.extend(extensions)
         hdus.append(fits.ImageHDU(self.initial.data, name="INITIAL_OPD"))
         hdus["INITIAL_OPD"].header["BUNIT"] = "m"
-        if self.systematics is not None:
-            hdus.extend(self.systematics.to_hdus())
+        if self.pattern is not None:
+            hdus.extend(self.pattern.to_hdus())
         if linear and self.stored_linear is not None:
             hdus.extend(linear_hdus(self.stored_linear))
         date = self.initial.date
@@ -677,7 +677,7 @@ class Refinement:
                 ),
                 status=Status[facts["status"]],
                 stored_linear=linear_of(hdus, len(frames), name) if "UNKNOWNS" in hdus else None,
-                systematics=Systematics.from_hdus(hdus) if "PATTERN" in hdus else None,
+                pattern=DetectorPattern.from_hdus(hdus) if "PATTERN" in hdus else None,
                 **plain,
             )
 
@@ -732,5 +732,5 @@ class Refinement:
             "seconds": self.seconds,
             "opd": self.initial.name,
             "opd_sha256": self.initial.sha256,
-            "systematics": "none" if self.systematics is None else self.systematics.name,
+            "pattern": "none" if self.pattern is None else self.pattern.name,
         }

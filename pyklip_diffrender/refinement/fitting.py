@@ -32,12 +32,12 @@ from pyklip_diffrender.refinement.fit_result import (
     breakdown_explained,
 )
 from pyklip_diffrender.refinement.forward import Problem, starting_values
-from pyklip_diffrender.refinement.settings import OWN_PARAMETERS, GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import OWN_PARAMETERS, FitSettings, settings_for
 from pyklip_diffrender.scene.admission import require_agreement
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern, require_pattern_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import require_imaged
-from pyklip_diffrender.scene.systematics import Systematics, require_pattern_of
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import as_opd_map
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -46,27 +46,27 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 _log = logging.getLogger(__name__)
 
-_STRUCTURE = 1.15
+_MORE_MODES_CHI2 = 1.15
 """Reduced chi-squared above which a fit is repeated with more modes."""
 
-_FEWEST_CYCLES = 24.0
+_DEFAULT_CYCLES = 24.0
 """Highest spatial frequency of the modes if the settings name none, as without a wavefront."""
 
-_FINER = 3e-3
-"""`GaussNewton.tolerance` for continuing a fit with a larger tolerance, such as a first look, that
+_FINER_TOLERANCE = 3e-3
+"""`FitSettings.tolerance` for continuing a fit with a larger tolerance, such as a first look, that
 does not explain its data. From a map three months old, the fit ends where it nearly explains the
 data of HIP 17695, and limits are 1.1 times higher."""
 
-_FOREIGN = 5.0
+_FOREIGN_LIGHT_CHI2 = 5.0
 """Reduced chi-squared above which more modes would not help, because the frame shows more than the
 star."""
 
 
-def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Unknown, float]]:
+def continue_from(fit: Refinement, **changes: Any) -> tuple[FitSettings, dict[Unknown, float]]:
     """Return the settings, and the starting values, with which to continue a fit.
 
     The prior has the final scales of the fit, and the companions are its final ones; `changes`
-    are other fields of `GaussNewton`. Raises `IncompatibleSetupError` if the fit was read from a
+    are other fields of `FitSettings`. Raises `IncompatibleSetupError` if the fit was read from a
     file without its linear model.
     """
     settings = fit.settings
@@ -90,7 +90,7 @@ def _with_scales(prior: WavefrontPrior, scales: Mapping[str, float], label: str)
 
 def fit_in_stages(
     problems: Sequence[Problem],
-    settings: GaussNewton,
+    settings: FitSettings,
     warm: Mapping[Unknown, float] | None = None,
     *,
     progress: bool,
@@ -110,17 +110,17 @@ def fit_in_stages(
         if last is not None:
             _log.info("residuals have structure: modes up to %g cycles", settings.cycles[k])
             adapted, warm = continue_from(last, cycles=settings.cycles[k:])
-        most = settings.cycles[k] if settings.cycles else _FEWEST_CYCLES
+        most = settings.cycles[k] if settings.cycles else _DEFAULT_CYCLES
         basis = settings.basis or default_basis(most, pupil)
         fit = _continued(
             last, Annealing(problems, adapted, basis, warm, progress, same_frames).run()
         )
-        if not fit.status.usable or not _STRUCTURE < fit.reduced_chi2 < _FOREIGN:
+        if not fit.status.usable or not _MORE_MODES_CHI2 < fit.reduced_chi2 < _FOREIGN_LIGHT_CHI2:
             break
     assert fit is not None
-    is_rough = settings.tolerance > _FINER and fit.status is Status.MODEL_MISMATCH
-    if is_rough and fit.reduced_chi2 < _FOREIGN:
-        adapted, warm = continue_from(fit, tolerance=_FINER)
+    is_rough = settings.tolerance > _FINER_TOLERANCE and fit.status is Status.MODEL_MISMATCH
+    if is_rough and fit.reduced_chi2 < _FOREIGN_LIGHT_CHI2:
+        adapted, warm = continue_from(fit, tolerance=_FINER_TOLERANCE)
         fit = _continued(fit, Annealing(problems, adapted, basis, warm, progress, fit).run())
     return fit
 
@@ -134,13 +134,13 @@ def _continued(earlier: Refinement | None, fit: Refinement) -> Refinement:
 
 
 def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> Refinement:
-    """Continue a refinement with other settings: `changes` are fields of `GaussNewton`.
+    """Continue a refinement with other settings: `changes` are fields of `FitSettings`.
 
     Raises `IncompatibleSetupError` if the fit was read from a file without its linear model.
     """
     settings, warm = continue_from(fit, **changes)
     problems = [
-        Problem(frame.model, frame.observation, fit.initial, frame.start, fit.systematics)
+        Problem(frame.model, frame.observation, fit.initial, frame.start, fit.pattern)
         for frame in fit.frames
     ]
     with breakdown_explained(problems[0].observation.name):
@@ -151,9 +151,9 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
 def align_frame(
     fit: Refinement,
     observation: Observation,
-    settings: GaussNewton,
+    settings: FitSettings,
     *,
-    systematics: Systematics | None,
+    pattern: DetectorPattern | None,
     companions: int = 0,
 ) -> Refinement:
     """Fit place, flux and background of a frame with the wavefront of another fit.
@@ -194,7 +194,7 @@ def align_frame(
     }
     start = starting_values(fit.model, observation, {})
     initial = replace(fit.initial, data=fit.wavefront)
-    problem = Problem(fit.model, observation, initial, {**shared, **start}, systematics)
+    problem = Problem(fit.model, observation, initial, {**shared, **start}, pattern)
     with breakdown_explained(observation.name):
         return fit_in_stages([problem], alone, progress=False)
 
@@ -202,9 +202,9 @@ def align_frame(
 def join_frames(
     fit: Refinement,
     others: Sequence[Refinement],
-    settings: GaussNewton,
+    settings: FitSettings,
     *,
-    systematics: Systematics | None,
+    pattern: DetectorPattern | None,
     companions: Sequence[Planet] | None = None,
     progress: bool = False,
 ) -> Refinement:
@@ -231,18 +231,18 @@ def join_frames(
             values = other.frames[0].values.get(name, ())
             warm |= {Unknown(name, i, k): float(value) for i, value in enumerate(values)}
     problems = [
-        Problem(frame.model, frame.observation, fit.initial, frame.start, systematics)
+        Problem(frame.model, frame.observation, fit.initial, frame.start, pattern)
         for frame in fit.frames
     ]
     for (frame,) in (other.frames for other in others):
         start = starting_values(fit.model, frame.observation, {})
-        problems.append(Problem(fit.model, frame.observation, fit.initial, start, systematics))
+        problems.append(Problem(fit.model, frame.observation, fit.initial, start, pattern))
     with breakdown_explained(problems[0].observation.name):
         joined = fit_in_stages(problems, settings, warm, progress=progress)
     return replace(joined, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
 
 
-# `refine`: fit the star in observed frames, starting from a wavefront map.
+# `refine`: fit the star in observed frames, starting from an OPD map.
 
 Start = Mapping[str, Any]
 
@@ -252,9 +252,9 @@ def refine(
     observation: Observation | Sequence[Observation],
     opd: Any,
     *,
-    settings: GaussNewton | None = None,
+    settings: FitSettings | None = None,
     start: Start | Sequence[Start] | None = None,
-    systematics: Systematics | None = None,
+    pattern: DetectorPattern | None = None,
     progress: bool = False,
 ) -> Refinement:
     """Refine an outdated wavefront until the rendered star matches the data.
@@ -267,17 +267,17 @@ def refine(
         The frames of one observation see the same star through the same wavefront and are
         averaged. Several observations (rolls, dithers, a reference star) are fitted together:
         each has its own star position, flux and background, their wavefront is shared, or differs
-        by as much as `GaussNewton.drift` allows, and companions rotate with the position angle.
+        by as much as `FitSettings.drift` allows, and companions rotate with the position angle.
     opd : path, OPDMap, Quantity, array or "flat"
         The wavefront to start from, entrance-pupil orientation; bare arrays in metres. The map is
         resampled to the model's pupil. "flat" stands for a flat wavefront.
-    settings : GaussNewton, optional
-        Default `GaussNewton.nircam()` for frames whose header says NIRCam, else `GaussNewton()`.
+    settings : FitSettings, optional
+        Default `FitSettings.nircam()` for frames whose header says NIRCam, else `FitSettings()`.
     start : dict or sequence of dict, optional
         Starting values by parameter name, for all observations or one by one. "detector_shift"
         is by default the place of the star in the observation.
-    systematics : Systematics, optional
-        Known flat-field pattern of other stars, see `learn_systematics`.
+    pattern : DetectorPattern, optional
+        Known detector pattern of other stars, see `learn_pattern`.
     progress : bool
         Show progress bars.
 
@@ -291,7 +291,7 @@ def refine(
     MissingOPDError
         If `opd` is None.
     IncompatibleSetupError
-        For settings that do not fit the model and the observations, and for systematics of another
+        For settings that do not fit the model and the observations, and for a pattern of another
         filter, mask or detector, of other pixels, or of the star itself.
     ShapeError, UnitError, NonFiniteError, NoValidPixelsError, CorruptFileError
         As their names say.
@@ -303,9 +303,9 @@ def refine(
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
-    >>> opd = dr.random_opd(1, npix=128)
+    >>> opd = dr.wavefront.random_opd(1, npix=128)
     >>> frames = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6))
+    >>> fit = dr.refine(model, frames, opd, settings=dr.FitSettings(cycles=6))
     >>> fit.status.name
     'CONVERGED'
     """
@@ -322,23 +322,23 @@ def refine(
     observations = _listed(observation)
     require_agreement(observations)
     adapted = settings_for(observations[0]) if settings is None else settings
-    if not isinstance(adapted, GaussNewton):
+    if not isinstance(adapted, FitSettings):
         raise IncompatibleSetupError(
-            f"settings: got a {type(adapted).__name__}, expected GaussNewton"
+            f"settings: got a {type(adapted).__name__}, expected FitSettings"
         )
-    if adapted.free == GaussNewton().free:
+    if adapted.free == FitSettings().free:
         # A system without a Lyot stop has no parameters of one.
         available = (*model.parameters, "flux", "background")
         adapted = replace(adapted, free=tuple(name for name in adapted.free if name in available))
     require_imaged(model, adapted.companions, "companions")
-    if systematics is not None:
+    if pattern is not None:
         for each in observations:
-            require_pattern_of(systematics, each)
+            require_pattern_of(pattern, each)
     wavefront = as_opd_map(opd)
     date = observations[0].date
     adapted = adapted.for_map_of_age(None if date is None else wavefront.days_after(date))
     problems = [
-        Problem(model, each, wavefront, starting_values(model, each, begin), systematics)
+        Problem(model, each, wavefront, starting_values(model, each, begin), pattern)
         for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)
     ]
     with breakdown_explained(observations[0].name):
@@ -358,7 +358,7 @@ def _listed(observation: Any) -> list[Observation]:
         what = repr(os.fspath(got)) if isinstance(got, str | os.PathLike) else type(got).__name__
         raise IncompatibleSetupError(
             f"observation: got {what}, expected an Observation or several, such as the "
-            "attribute science of Sequence.from_files(files).cutout(size)"
+            "attribute science of ExposureSequence.from_files(files).cutout(size)"
         )
     if not listed:
         raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
@@ -378,49 +378,49 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
 
 # The flux of the star: from a fit to Jansky, and from a catalogue into a fit.
 
-_UNTIED = 0.1
+_FLUX_ERROR = 0.1
 """Relative error of the star's flux in real frames if no catalogue says it. Only diffracted light
 is seen, and the prior on the wavefront decides how much of it a star has: fits with a star 10 %
 brighter or fainter explain real frames nearly as well (docs/validation/real_frames.md)."""
 
-_WITHOUT_MAP = 0.4
+_FLUX_ERROR_FLAT_START = 0.4
 """Relative error for fits that start from a flat wavefront: two rolls of G 7-34 came out 2 % too
 faint in F444W, and 44 % too bright in F356W."""
 
-_HELD = 0.003
+_HELD_FLUX_ERROR = 0.003
 """Relative deviation of a star's flux from the catalogue's. The posterior of a fit understates
 the error of the flux, so that a prior as wide as the catalogue's error would hardly move it."""
 
-_AGREES = 0.005
+_SETTLED_FLUX_DIFFERENCE = 0.005
 """Largest relative difference between the star's flux and the catalogue's after a fit: a tenth of
 the error of a good catalogue."""
 
-_ROUNDS = 3
+_MOST_HELD_FITS = 3
 """Largest number of fits with the flux held; each starts from the one before."""
 
-_TIGHTER = 100.0
+_HELD_FLUX_FACTOR = 100.0
 """Factor by which the next of these fits holds the flux more tightly."""
 
-_DISAGREES = 3.0
+_DISAGREEING_FLUX_RATIO = 3.0
 """Ratio of a star's stated and fitted flux, beyond the error of the fit, from which one of the two
 is wrong. The fitted flux was at most 1.31 times too bright in forty simulated visits, and
 from a flat wavefront 1.44 times in real frames. The square is allowed where a fit from a flat
 wavefront did not explain them (3.7 times), and where only the alignment is fitted (6 % with the
 wavefront of a map, 4.2 times with a flat one). Units differ by at least a thousand."""
 
-_MEANT = (
+_UNITS_PROBABLY_MEANT = (
     u.mJy, u.uJy, u.nJy, u.ABmag, u.W / u.m**2 / u.um, u.erg / u.s / u.cm**2 / u.AA,
     u.erg / u.s / u.cm**2 / u.Hz,
 )  # fmt: skip
 """Units in which a number that is not in Jy may have been stated."""
 
-_BRIGHTNESS = u.MJy / u.sr
+_FRAME_UNIT = u.MJy / u.sr
 
 
 def _pixel_area(observation: Observation) -> float | None:
     """Solid angle of a pixel, sr, in the photometric calibration; None without calibration."""
     area = known_number(observation.header, "PIXAR_SR")
-    if not (observation.is_nircam and observation.unit.is_equivalent(_BRIGHTNESS)):
+    if not (observation.is_nircam and observation.unit.is_equivalent(_FRAME_UNIT)):
         return None
     return area if area is not None and area > 0 else None
 
@@ -450,7 +450,7 @@ def jansky_per_unit(frame: FrameFit) -> float | None:
     # A tensor, because the wavefront is complex where the pupil's amplitude was fitted.
     opd = torch.from_numpy(np.ascontiguousarray(frame.opd))
     transmission = frame.model.transmission(opd, **frame.optical_values)
-    return float(transmission * area * frame.observation.unit.to(_BRIGHTNESS) * 1e6)
+    return float(transmission * area * frame.observation.unit.to(_FRAME_UNIT) * 1e6)
 
 
 def to_jansky(star_flux: float | str | u.Quantity) -> float:
@@ -486,14 +486,14 @@ def require_agreement_of_flux(fit: Refinement, stated: float) -> None:
     The fit may be of the alignment alone, which tells a mistaken unit.
     """
     frame, error = fit.frames[0], star_flux_error(fit)
-    seen, limit = _scale(frame) * frame.flux, _DISAGREES * (1 + error)
+    seen, limit = _scale(frame) * frame.flux, _DISAGREEING_FLUX_RATIO * (1 + error)
     if not (fit.status.calibrated or (fit.settings.wavefront and fit.initial.data.any())):
-        limit *= _DISAGREES
+        limit *= _DISAGREEING_FLUX_RATIO
     if 1 / limit < stated / seen < limit:
         return
     wavelength = float(np.mean(fit.model.bandpass.wavelengths)) * u.m
     meant = ""
-    for unit in _MEANT:
+    for unit in _UNITS_PROBABLY_MEANT:
         jansky = (stated * unit).to_value(u.Jy, u.spectral_density(wavelength))
         if 1 / limit < jansky / seen < limit:
             meant = (
@@ -513,7 +513,7 @@ def with_star_flux(
     star_flux: float,
     error: float,
     *,
-    held: float = _HELD,
+    held: float = _HELD_FLUX_ERROR,
     progress: bool = False,
 ) -> Refinement:
     """Continue a fit of one star with its flux held at a catalogue's value, Jy in the filter.
@@ -526,7 +526,7 @@ def with_star_flux(
     for frame in fit.frames:
         require_calibrated(frame.observation)
     require_agreement_of_flux(fit, star_flux)
-    for _ in range(_ROUNDS):
+    for _ in range(_MOST_HELD_FITS):
         # The wavefront makes up for the change of the diffracted light, so that contrasts refer to
         # the catalogue's star.
         frames = [
@@ -537,11 +537,11 @@ def with_star_flux(
         deviations = {**fit.settings.deviations, "flux": held}
         fit = refine_again(known, progress=progress, deviations=deviations)
         shares = [_scale(frame) * frame.flux / star_flux for frame in fit.frames]
-        if max(abs(share - 1) for share in shares) < _AGREES:
+        if max(abs(share - 1) for share in shares) < _SETTLED_FLUX_DIFFERENCE:
             break
         # The light that passes the stop has changed with the wavefront and the pupil's amplitude,
         # or the frames pull at the flux more than it is held.
-        held /= _TIGHTER
+        held /= _HELD_FLUX_FACTOR
     return fit
 
 
@@ -555,10 +555,10 @@ def star_flux_error(fit: Refinement) -> float:
     """Relative error of the star's flux that is not in the fit's own covariance.
 
     The error of the catalogue, if there is one. Otherwise 10 % for real frames, where only
-    diffracted light tells how bright the star is (40 % without a wavefront map), and 0 for others.
+    diffracted light tells how bright the star is (40 % without an OPD map), and 0 for others.
     """
     if fit.catalogue_error is not None:
         return fit.catalogue_error
     if not fit.frames[0].observation.is_nircam:
         return 0.0
-    return _UNTIED if fit.initial.data.any() else _WITHOUT_MAP
+    return _FLUX_ERROR if fit.initial.data.any() else _FLUX_ERROR_FLAT_START

@@ -31,9 +31,9 @@ from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.exposure import flat_field_of, module_of
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # A frame to be fitted: data, noise, and the forward model in the data's unit.
@@ -54,7 +54,7 @@ class Problem:
     # Starting values of optical parameters (numbers in the units of the parameter table, or
     # Quantities), and of "flux" and "background" where known.
     start: dict[str, Any] = dataclasses.field(default_factory=dict)
-    systematics: Systematics | None = None  # Flat-field pattern of these pixels, with its error.
+    pattern: DetectorPattern | None = None  # Detector pattern of these pixels, with its error.
 
     def __post_init__(self) -> None:
         if self.observation.shape != self.model.detector.shape:
@@ -82,11 +82,11 @@ class Problem:
         self.gain = torch.ones_like(self.data)
         self.gain_error = torch.zeros_like(self.data)
         self.pedestal = 0.0
-        if self.systematics is not None:
-            pattern, error = self.systematics.at(self.observation)
+        if self.pattern is not None:
+            pattern, error = self.pattern.at(self.observation)
             self.gain = 1 + torch.from_numpy(pattern).to(device)
             self.gain_error = torch.from_numpy(error).to(device)
-            self.pedestal = self.systematics.pedestal
+            self.pedestal = self.pattern.pedestal
 
     def leave_out(self, pixels: Tensor) -> None:
         """Mask pixels, (ny, nx), in all frames of the observation."""
@@ -230,7 +230,7 @@ def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np
 
 # The forward model of a fit and its derivatives, at a point of the unknowns.
 
-_DIFFERENCE = 5e-4
+_SHIFT_ARCSEC = 5e-4
 """arcsec between images whose difference is a derivative; accurate to 1e-4."""
 
 
@@ -243,15 +243,15 @@ class Point:
     opd: Tensor  # (npix, npix), m; complex where the pupil's amplitude is free.
     fields: list[Tensor]  # The star's field at each wavelength, at flux 1.
     image: Tensor  # (ny, nx), the star at flux 1.
-    # (ny, nx), the star in the data's unit, with the known flat-field pattern in its light and in
-    # the pedestal, see `Systematics`.
+    # (ny, nx), the star in the data's unit, with the known detector pattern in its light and in
+    # the pedestal, see `DetectorPattern`.
     light: Tensor
     star: Tensor  # (ny, nx), the star and the background.
     total: Tensor  # (ny, nx), with the companions.
 
     @property
     def multiplied(self) -> Tensor:
-        """Light that the flat-field pattern multiplies, (ny, nx)."""
+        """Light that the detector pattern multiplies, (ny, nx)."""
         return self.light + self.unknowns.level("pedestal", self.vector)
 
 
@@ -500,11 +500,11 @@ class Forward:
         Central differences: four images take a quarter of the time of forward-mode derivatives.
         """
         offset, slopes = values["star_offset"], []
-        for step in _DIFFERENCE * torch.eye(2, dtype=offset.dtype, device=offset.device):
+        for step in _SHIFT_ARCSEC * torch.eye(2, dtype=offset.dtype, device=offset.device):
             with torch.no_grad():
                 ahead = self.coarse(opd, **{**values, "star_offset": offset + step})
                 behind = self.coarse(opd, **{**values, "star_offset": offset - step})
-            slopes.append((ahead.double() - behind.double()).cpu() / (2 * _DIFFERENCE))
+            slopes.append((ahead.double() - behind.double()).cpu() / (2 * _SHIFT_ARCSEC))
         return torch.stack(slopes)
 
 
@@ -593,7 +593,7 @@ def allowance(forward: Forward) -> float:
 
 # Chi-squared of a fit to one or several frames.
 
-_MAX_KAPPA = 10.0
+_LARGEST_KAPPA = 10.0
 """Largest model error, as a fraction of the star."""
 
 
@@ -630,7 +630,7 @@ class Objective:
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
         # Which frames show the same pixels of the detector through the same flat field, so that the
-        # error of the systematics is one unknown in all of them. In other frames it is noise.
+        # error of the pattern is one unknown in all of them. In other frames it is noise.
         self.shares_pattern = _sharing([forward.problem for forward in self.forwards])
         self.robust = robust
 
@@ -654,7 +654,7 @@ class Objective:
         return torch.sqrt(self.noise(frame, point) ** 2 + (kappa * point.total) ** 2)
 
     def noise(self, frame: int, point: Point) -> Tensor:
-        """Noise of the data and, in quadrature, the error of the systematics."""
+        """Noise of the data and, in quadrature, the error of the pattern."""
         problem = self.forwards[frame].problem
         return torch.hypot(problem.sigma, problem.gain_error * point.multiplied)
 
@@ -722,7 +722,7 @@ class Objective:
         # at which it is 1.
         if float((residual / noise).mean()) <= 1:
             return 0.0
-        low, high = 0.0, _MAX_KAPPA
+        low, high = 0.0, _LARGEST_KAPPA
         for _ in range(50):
             middle = (low + high) / 2
             too_small = float((residual / (noise + middle**2 * star)).mean()) > 1
@@ -736,7 +736,7 @@ def _sharing(problems: Sequence[Problem]) -> tuple[bool, ...]:
     Of several such sets only the largest shares the pattern, or the first of equal ones.
     """
     places = [
-        (seen.first_pixel, seen.shape, flat_field_of(seen.header, seen.name), id(each.systematics))
+        (seen.first_pixel, seen.shape, flat_field_of(seen.header, seen.name), id(each.pattern))
         for each in problems
         for seen in (each.observation,)
     ]
@@ -745,7 +745,7 @@ def _sharing(problems: Sequence[Problem]) -> tuple[bool, ...]:
         for place, problem in zip(places, problems, strict=True)
         if place[0] is not None and bool((problem.gain_error > 0).any())
     ]
-    # Such frames have the same first pixel, shape, flat field and systematics.
+    # Such frames have the same first pixel, shape, flat field and pattern.
     most = max(known, key=known.count, default=None)
     if most is None or known.count(most) < 2:
         return (False,) * len(problems)

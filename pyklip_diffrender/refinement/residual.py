@@ -40,7 +40,7 @@ def local_maxima(
 INNER = 0.35
 """arcsec; closer to the star, the occulter distorts images and the star's errors dominate."""
 
-_APART = 0.15
+_PEAK_FROM_COMPANION_ARCSEC = 0.15
 """arcsec, about lambda/D; closer to a known companion, peaks are its own residuals."""
 
 
@@ -129,7 +129,7 @@ def bright_companions(
     allowed = (np.hypot(places[..., 0], places[..., 1]) > inner) & valid
     positions = unknowns.sources(state.points[first].vector)[:, 1:] @ unknowns.turn.T
     for known in positions.numpy():
-        allowed &= np.hypot(*np.moveaxis(places - known, -1, 0)) > _APART
+        allowed &= np.hypot(*np.moveaxis(places - known, -1, 0)) > _PEAK_FROM_COMPANION_ARCSEC
     if not allowed.any():  # The frames do not reach beyond `inner`.
         return []
     scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
@@ -191,27 +191,27 @@ def with_dominant(objective: Objective, state: State, kappa: float) -> State:
 # of the fit they are compared twice: in place of the companion, which may be the bad pixel itself,
 # and beside it.
 
-_SIGNIFICANT = 6.0
+_OUTLIER_SIGMAS = 6.0
 """Deviation of an outlier in standard deviations, of the prediction from all other pixels."""
 
-_BETTER = 1.3
+_OUTLIER_CHI2_RATIO = 1.3
 """Smallest ratio of the chi-squared explained by an outlier and by a point source. The ratio was 4
 to 30 for bad pixels of NIRCam. For the brightest pixel of a planet it is below 0.2 in F444W, and
 cannot exceed 1, which it approaches where the image of a point is as sharp as a pixel."""
 
-_DEVIATES = 2.0
+_OUTLIER_CONTRIBUTION_SIGMAS = 2.0
 """Smallest contribution of an outlier to Sigma^-1 r, which is less than the outlier's deviation
 where the fit has taken a part of it."""
 
-_NEAR_COMPANION = 2.0
+_OUTLIER_BESIDE_COMPANION_PIXELS = 2.0
 """Pixels between an outlier and a companion that may be nothing but the outlier."""
 
-_WRONG = 0.3
+_OUTLIER_COMPANION_RATIO = 0.3
 """Smallest deviation of an outlier beside such a companion, relative to the companion's brightest
 pixel. The model of the companion's image may be wrong by more than the noise, and a second source
 would explain that no better than a single pixel."""
 
-_MOST = 50
+_MOST_COMPARED_PIXELS = 50
 """Largest number of pixels of a frame that are compared, largest deviation first."""
 
 
@@ -238,19 +238,19 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
             pixel = torch.tensor([[row, column]])
             sources = {k: forward.sources(point, place + beside).cpu()}
             models = [linear]
-            if bool((distances < _NEAR_COMPANION).any()):
+            if bool((distances < _OUTLIER_BESIDE_COMPANION_PIXELS).any()):
                 if star_only is None:
                     # This model has its own copy of the Jacobians, as large as the fit's.
                     star_only = linear.without("companions", companions)
                 light = companions[k][max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
                 products = linear.weigh_pixels(k, pixel)
                 amplitude = products.numerator / products.information.clamp(min=1e-300)
-                exceeds = float(amplitude.abs()) > _WRONG * float(light.max())
+                exceeds = float(amplitude.abs()) > _OUTLIER_COMPANION_RATIO * float(light.max())
                 models = [star_only, linear] if exceeds else [star_only]
             mask[row, column] = any(
                 bool(
                     _explained(model.weigh_pixels(k, pixel))
-                    > _BETTER * _explained(model.weigh(sources)).max()
+                    > _OUTLIER_CHI2_RATIO * _explained(model.weigh(sources)).max()
                 )
                 for model in models
             )
@@ -261,14 +261,14 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
 def _deviating(linear: LinearModel, k: int) -> list[tuple[int, int]]:
     """Row and column of pixels that deviate more than their neighbours, largest deviation first."""
     cleaned = linear.cleaned[k]
-    places = torch.nonzero(cleaned.abs() > _DEVIATES)
+    places = torch.nonzero(cleaned.abs() > _OUTLIER_CONTRIBUTION_SIGMAS)
     if not len(places):
         return []
     deviations = torch.zeros_like(cleaned)
     explained = _explained(linear.weigh_pixels(k, places))
     deviations[places[:, 0], places[:, 1]] = explained.sqrt()
-    peaks = local_maxima(deviations.numpy(), deviations.numpy() > 0, _SIGNIFICANT, size=3)
-    return peaks[:_MOST]
+    peaks = local_maxima(deviations.numpy(), deviations.numpy() > 0, _OUTLIER_SIGMAS, size=3)
+    return peaks[:_MOST_COMPARED_PIXELS]
 
 
 def _explained(products: TemplateProducts) -> Tensor:

@@ -24,14 +24,14 @@ from pyklip_diffrender.scene.simulation import pupil_samples
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, WavefrontPrior, scale_ratios
 
-_REACH = 40
+_FITTED_REACH_PIXELS = 40
 """Pixels from the star to the edge of the square that `reduce` fits."""
 
 _MOST_CYCLES = 32
 """Highest spatial frequency of the preset: 3,200 modes. Each of them takes a float for every pixel,
 and the time of a step grows with their square."""
 
-_LONG_WAVE = 2.4e-6
+_LONG_WAVE_FROM_M = 2.4e-6
 """m; beyond, NIRCam has its long-wave detectors, whose pixels are twice as wide."""
 
 _SHORT_WAVE_DRIFT = WavefrontPrior(
@@ -58,27 +58,27 @@ _DRIFT_RANGE = 4.0
 _SWITCHES = (
     "wavefront", "adapt_prior", "marginal_flux", "companions_if_stalled", "accurate_steps",
 )  # fmt: skip
-"""Fields of `GaussNewton` that are True or False."""
+"""Fields of `FitSettings` that are True or False."""
 
 OWN_PARAMETERS = ("star_offset", "detector_shift", "flux", "background", "pedestal")
 """Parameters with a value for every frame when several frames are fitted together; the frames
 share the others."""
 
-_RING = (5.0, 16.0)
-_REFERENCE = 1800.0
+_REFERENCE_RING_PIXELS = (5.0, 16.0)
+_REFERENCE_SQUARED_SNR = 1800.0
 """Median of the squared S/N of pixels at these distances from the star, pixels, in one roll of
 G 7-34 in F444W, for which `benchmarks.scene_fidelity` measured what a coarser model costs."""
 
-_VERY_FAINT = 100.0
+_VERY_FAINT_RATIO = 100.0
 
 _COARSE_NPIX = 128
 """Samples across the pupil for a first look, half as many as in `model_for`."""
 
-_SHARES = ((100.0, 0.4), (4.0, 0.55), (0.0, 0.77))
+_QUICK_CYCLE_SHARES = ((100.0, 0.4), (4.0, 0.55), (0.0, 0.77))
 """Share of the spatial frequencies that a first look fits, by how many times the star is fainter
 than G 7-34, compared with its noise."""
 
-_QUICK: dict[str, Any] = {
+_QUICK_SETTINGS: dict[str, Any] = {
     "response_npix": 64,
     "response_wavelengths": 3,
     "tolerance": 0.02,
@@ -90,19 +90,19 @@ by up to 4 %; with 0.03, the fit of two rolls of HIP 17695 in F356W ends before 
 frames. Without accurate steps, limits are 1.3 times as large. With three wavelengths in the model,
 the fit does not explain the frames."""
 
-_PROCESS = 1.3e9
+_PROCESS_BYTES = 1.3e9
 """Memory that the package and PyTorch take, with what a fit needs for a while, bytes."""
 
 
 @dataclass(frozen=True)
-class GaussNewton:
+class FitSettings:
     """Settings of the default method: damped Gauss-Newton on wavefront modes with a prior.
 
     Attributes
     ----------
     free : tuple of str
         Free parameters besides the wavefront, from the parameter table. The pedestal of a known
-        pattern is always free, see `pyklip_diffrender.Systematics`.
+        pattern is always free, see `pyklip_diffrender.DetectorPattern`.
     wavefront : bool
         Fit the wavefront; False fits the alignment only.
     cycles : tuple of float
@@ -188,8 +188,8 @@ class GaussNewton:
 
     Examples
     --------
-    >>> from pyklip_diffrender import GaussNewton
-    >>> GaussNewton(cycles=16).cycles
+    >>> from pyklip_diffrender import FitSettings
+    >>> FitSettings(cycles=16).cycles
     (16.0,)
     """
 
@@ -283,9 +283,9 @@ class GaussNewton:
         if self.memory is None:
             return math.inf
         # Some of what is freed does not return to the system at once.
-        return max(0.0, 0.9 * self.memory - _PROCESS - arrays)
+        return max(0.0, 0.9 * self.memory - _PROCESS_BYTES - arrays)
 
-    def for_map_of_age(self, days: float | None) -> GaussNewton:
+    def for_map_of_age(self, days: float | None) -> FitSettings:
         """Return settings whose prior on the segments has grown with the age of the map, days.
 
         The settings do not change for a map of unknown age, or if `adapt_prior` is False.
@@ -295,7 +295,7 @@ class GaussNewton:
             return self
         return replace(self, prior=self.prior.widened({"segment": growth}))
 
-    def with_wider_priors(self, ratios: Mapping[str, float]) -> GaussNewton:
+    def with_wider_priors(self, ratios: Mapping[str, float]) -> FitSettings:
         """Return settings whose priors have scales multiplied by ratios above 1.
 
         Parameters
@@ -312,7 +312,7 @@ class GaussNewton:
             dither_drift=self.dither_drift and self.dither_drift.widened(of_dither),
         )
 
-    def with_narrower_prior(self, size: float, amplitude: float) -> GaussNewton:
+    def with_narrower_prior(self, size: float, amplitude: float) -> FitSettings:
         """Return settings with a narrower prior on the wavefront that all frames share.
 
         Parameters
@@ -327,14 +327,14 @@ class GaussNewton:
         amplitude_scale = min(1.0, amplitude) * prior.amplitude_scale
         return replace(self, prior=replace(prior, scales=scales, amplitude_scale=amplitude_scale))
 
-    def with_drift_scales(self, ratios: Mapping[str, float], within: GaussNewton) -> GaussNewton:
+    def with_drift_scales(self, ratios: Mapping[str, float], within: FitSettings) -> FitSettings:
         """Return settings whose drifts have scales multiplied by ratios, within bounds.
 
         Parameters
         ----------
         ratios : mapping of str to float
             As for `with_wider_priors`; ratios of groups of `prior` do not count.
-        within : GaussNewton
+        within : FitSettings
             Settings whose drifts are the middle of the bounds, `_DRIFT_RANGE` times to either side.
             Dithers may differ by as much as exposures with a slew between them.
         """
@@ -362,11 +362,11 @@ class GaussNewton:
         cls,
         filter: str | None = None,
         *,
-        reach: int = _REACH,
+        reach: int = _FITTED_REACH_PIXELS,
         image_mask: str | None = None,
         module: str | None = None,
         **changes: Any,
-    ) -> GaussNewton:
+    ) -> FitSettings:
         """Return the settings for real NIRCam frames, for which the model is not exact.
 
         The prior's scales are fixed unless they are much too small, the pupil's amplitude is free
@@ -403,12 +403,12 @@ class GaussNewton:
 
         Examples
         --------
-        >>> from pyklip_diffrender import GaussNewton
-        >>> GaussNewton.nircam("F356W", max_iterations=60).cycles
+        >>> from pyklip_diffrender import FitSettings
+        >>> FitSettings.nircam("F356W", max_iterations=60).cycles
         (22.0,)
         """
         wavelength = _wavelength("F444W" if filter is None else filter)
-        short = wavelength <= _LONG_WAVE
+        short = wavelength <= _LONG_WAVE_FROM_M
         loose = 1.0 if stop_is_measured(image_mask, short, module) else 3.0
         preset = cls(
             free=(
@@ -467,11 +467,13 @@ def _labelled(ratios: Mapping[str, float], label: str) -> dict[str, float]:
     return {n.removesuffix(label): ratio for n, ratio in ratios.items() if n.endswith(label)}
 
 
-def settings_for(observation: Observation) -> GaussNewton:
+def settings_for(observation: Observation) -> FitSettings:
     """Return the default settings for an observation: the NIRCam preset for real NIRCam frames."""
     if not observation.is_nircam:
-        return GaussNewton()
-    return nircam_settings(observation, reach=max(_REACH, min(observation.shape) // 2))
+        return FitSettings()
+    return nircam_settings(
+        observation, reach=max(_FITTED_REACH_PIXELS, min(observation.shape) // 2)
+    )
 
 
 def faintness(observation: Observation) -> float:
@@ -480,39 +482,39 @@ def faintness(observation: Observation) -> float:
     y, x = np.indices(frame.shape)
     column, row = frame.center[0]
     away = np.hypot(x - column, y - row)
-    ring = frame.valid[0] & (away > _RING[0]) & (away < _RING[1])
+    ring = frame.valid[0] & (away > _REFERENCE_RING_PIXELS[0]) & (away < _REFERENCE_RING_PIXELS[1])
     if not ring.any():
         return 1.0
     # The chi-squared of an error of the model that is a fraction of the light is proportional to
     # (S/N)^2.
     squares = (frame.data[0][ring] / frame.error[0][ring]) ** 2
-    return _REFERENCE / max(float(np.median(squares)), 1e-6)
+    return _REFERENCE_SQUARED_SNR / max(float(np.median(squares)), 1e-6)
 
 
 def coarse_arguments(observation: Observation, shape: tuple[int, int]) -> dict[str, Any]:
     """Arguments of `model_for`, by the noise, for a first look at (ny, nx) pixels."""
-    nlambda = 3 if faintness(observation) >= _VERY_FAINT else 7
+    nlambda = 3 if faintness(observation) >= _VERY_FAINT_RATIO else 7
     if observation.filter is None:
         return {}
     return {"nlambda": nlambda, "npix": pupil_samples(observation, shape, _COARSE_NPIX)}
 
 
-def quick_settings(observation: Observation) -> GaussNewton:
+def quick_settings(observation: Observation) -> FitSettings:
     """Settings for a first look: `settings_for` with fewer modes and coarser derivatives."""
     settings, faint = settings_for(observation), faintness(observation)
-    share = next(share for least, share in _SHARES if faint >= least)
+    share = next(share for least, share in _QUICK_CYCLE_SHARES if faint >= least)
     cycles = float(max(4, round(share * settings.cycles[0])))
     prior = settings.prior
     if prior.amplitude_cycles:
         prior = replace(prior, amplitude_cycles=min(prior.amplitude_cycles, cycles))
-    return replace(settings, cycles=(cycles,), prior=prior, **_QUICK)
+    return replace(settings, cycles=(cycles,), prior=prior, **_QUICK_SETTINGS)
 
 
-def nircam_settings(observation: Observation, **changes: Any) -> GaussNewton:
-    """Return the preset `GaussNewton.nircam` for an observation's filter, mask and module."""
+def nircam_settings(observation: Observation, **changes: Any) -> FitSettings:
+    """Return the preset `FitSettings.nircam` for an observation's filter, mask and module."""
     header, name = observation.header, observation.name
     mask = image_mask(header, name)
-    return GaussNewton.nircam(
+    return FitSettings.nircam(
         observation.filter, image_mask=mask, module=module_of(header, name), **changes
     )
 
@@ -529,20 +531,20 @@ def _wavelength(filter: str) -> float:
 
 def _cycles_to_edge(wavelength: float, reach: int) -> float:
     """Spatial frequency that moves light by `reach` pixels of NIRCam, if it is not too high."""
-    pixel = 0.063 if wavelength > _LONG_WAVE else 0.031
+    pixel = 0.063 if wavelength > _LONG_WAVE_FROM_M else 0.031
     return float(min(_MOST_CYCLES, int(reach * pixel * ARCSEC * JWST_DIAMETER / wavelength)))
 
 
 # Priors of the modes of a fit: amplitude, wavefront, and its drift between frames.
 
-_IMPROBABLE = 1.5
+_WRONG_PRIOR_SCALE_RATIO = 1.5
 """Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
 
 
-_SAME_SEQUENCE = 2.0 / 24
+_SAME_SEQUENCE_DAYS = 2.0 / 24
 """Days between the beginnings of frames of one exposure sequence: nine dithers of a faint star."""
 
-_SAME_ROLL = 1.0
+_SAME_ROLL_DEG = 1.0
 """Degrees by which the roll may differ within an exposure sequence."""
 
 
@@ -565,12 +567,12 @@ def _follows(one: Observation, other: Observation) -> bool:
     if one.target != other.target or one.reference != other.reference:
         return False
     dates = [each.date.mjd for each in (one, other) if each.date is not None]
-    if max(dates, default=0.0) - min(dates, default=0.0) > _SAME_SEQUENCE:
+    if max(dates, default=0.0) - min(dates, default=0.0) > _SAME_SEQUENCE_DAYS:
         return False
     angle, other_angle = one.position_angles, other.position_angles
     if angle is None or other_angle is None:
         return True
-    return abs(half_circle(float(angle[0] - other_angle[0]))) <= _SAME_ROLL
+    return abs(half_circle(float(angle[0] - other_angle[0]))) <= _SAME_ROLL_DEG
 
 
 def count_modes_below(basis: Basis, cycles: float) -> int:
@@ -598,7 +600,7 @@ class ModePriors:
 
     @classmethod
     def of(
-        cls, settings: GaussNewton, basis: Basis, observations: Sequence[Observation]
+        cls, settings: FitSettings, basis: Basis, observations: Sequence[Observation]
     ) -> ModePriors:
         """Return the priors of a fit to frames of these observations."""
         prior, drift, dither = settings.prior, settings.drift, settings.dither_drift
@@ -641,7 +643,7 @@ class ModePriors:
         """Standard deviations of amplitude, wavefront and drift, in this order."""
         return torch.cat([self.amplitude, self.scales[self.group] * self.shape])
 
-    def ratios_if_fixed(self, update: EvidenceUpdate, settings: GaussNewton) -> dict[str, float]:
+    def ratios_if_fixed(self, update: EvidenceUpdate, settings: FitSettings) -> dict[str, float]:
         """Size of the fitted modes relative to their priors, by group; empty if they are fitted."""
         is_fixed = settings.wavefront and not settings.prior.fit_scales
         return self.ratios(update) if is_fixed else {}
@@ -649,7 +651,7 @@ class ModePriors:
     def are_improbable(self, ratios: Mapping[str, float]) -> bool:
         """Whether the wavefront is too large for its prior."""
         of_wavefront = [ratios[name] for name in self.names if ratios]
-        return max(of_wavefront, default=0.0) >= _IMPROBABLE
+        return max(of_wavefront, default=0.0) >= _WRONG_PRIOR_SCALE_RATIO
 
     def counted(self, update: EvidenceUpdate) -> ModePriors:
         """These priors, with the number of modes that the data determine."""

@@ -38,22 +38,22 @@ from pyklip_diffrender.refinement.forward import (
     State,
     allowance,
 )
-from pyklip_diffrender.refinement.settings import OWN_PARAMETERS, GaussNewton, ModePriors
+from pyklip_diffrender.refinement.settings import OWN_PARAMETERS, FitSettings, ModePriors
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_evidence
 
 # The unknowns of a fit, and the values from which they start.
 
-_PEDESTAL = 0.5
+_PEDESTAL_PRIOR_ERROR = 0.5
 """Relative prior deviation of the pedestal of a known pattern."""
 
-_BRIGHT = 0.3
+_BRIGHT_PIXEL_RATIO = 0.3
 """Brightness of pixels where the star is bright, relative to its brightest one."""
 
 
 def first_unknowns(
-    forwards: Sequence[Forward], settings: GaussNewton, basis: Basis, priors: ModePriors
+    forwards: Sequence[Forward], settings: FitSettings, basis: Basis, priors: ModePriors
 ) -> Unknowns:
     """The unknowns of frames that are fitted together, before companions are added.
 
@@ -73,14 +73,14 @@ def first_unknowns(
 
 
 def _frame_unknowns(
-    forward: Forward, settings: GaussNewton, modes: int, amplitude_modes: int, roll: float
+    forward: Forward, settings: FitSettings, modes: int, amplitude_modes: int, roll: float
 ) -> FrameUnknowns:
     problem = forward.problem
     free, deviations = settings.free, dict(settings.deviations)
     start = problem.optical_start(tuple(n for n in free if n in problem.model.parameters))
     if problem.has_free_pedestal:
         free = (*free, "pedestal")
-        deviations["pedestal"] = _PEDESTAL * problem.pedestal
+        deviations["pedestal"] = _PEDESTAL_PRIOR_ERROR * problem.pedestal
     zero = torch.zeros(1, dtype=torch.float64)
     levels = {"flux": zero, "background": zero, "pedestal": zero + problem.pedestal}
     # The unknowns and their algebra stay on the CPU, wherever the model renders.
@@ -126,7 +126,7 @@ def _median_flux(problem: Problem, image: Tensor) -> float:
 
     Least squares give a negative flux where a companion outshines what the mask leaves of the star.
     """
-    bright = problem.valid & (image > _BRIGHT * image[problem.valid].max())
+    bright = problem.valid & (image > _BRIGHT_PIXEL_RATIO * image[problem.valid].max())
     return float((problem.data[bright] / image[bright]).median())
 
 
@@ -167,7 +167,7 @@ class NormalEquations:
         return all(each.error <= max(error, each.allowance) for each in self.derivatives)
 
 
-_BLOCK = 256
+_ROWS_AT_A_TIME = 256
 """Rows of a large matrix that are copied at a time."""
 
 
@@ -191,11 +191,11 @@ def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Ten
 
 def _mirror(matrix: Tensor) -> Tensor:
     """Copy the lower triangle of a square matrix onto the upper one, in place, block by block."""
-    for start in range(0, len(matrix), _BLOCK):
-        block = slice(start, start + _BLOCK)
+    for start in range(0, len(matrix), _ROWS_AT_A_TIME):
+        block = slice(start, start + _ROWS_AT_A_TIME)
         corner = matrix[block, block]
         corner.copy_(corner.tril() + corner.tril(-1).T)
-        matrix[block, start + _BLOCK :] = matrix[start + _BLOCK :, block].T
+        matrix[block, start + _ROWS_AT_A_TIME :] = matrix[start + _ROWS_AT_A_TIME :, block].T
     return matrix
 
 
@@ -270,13 +270,13 @@ def linearise(
 # vector take as long as three images. The coarse copy's equations precondition them, and may come
 # from an earlier step.
 
-_ITERATIONS = 6
-_SUFFICIENT = 0.05
+_GRADIENT_ITERATIONS = 6
+_GRADIENT_TOLERANCE = 0.05
 
-_ROUNDING = 1e-12
+_CURVATURE_ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
 
-_DIFFERENCE = 0.01
+_CURVATURE_STEP_RATIO = 0.01
 """Part of a step between the images whose difference is a derivative. Over this part, curvature
 matters less than the rounding errors of single precision."""
 
@@ -320,7 +320,7 @@ class ModelDerivatives:
         """Product of the curvature with a step, (unknowns,)."""
         # A s = J C^-1 (J^T s): a difference of two images along the step s has J^T s, and `_pull`
         # applies J C^-1 in reverse mode.
-        vector, images, sources = self._state.vector + _DIFFERENCE * step, {}, []
+        vector, images, sources = self._state.vector + _CURVATURE_STEP_RATIO * step, {}, []
         for k, before in enumerate(self._without_faint):
             sources.append(before.unknowns.visible_sources(before.vector)[self._bright[k]])
             if k in self._rough:
@@ -330,7 +330,7 @@ class ModelDerivatives:
             after = self._objective.forwards[k].at(
                 before.unknowns, rows.of_unknowns(vector), bright
             )
-            images[k] = (after.total - before.total) / _DIFFERENCE
+            images[k] = (after.total - before.total) / _CURVATURE_STEP_RATIO
             if not bool(bright.all()):
                 images[k] = images[k] + self._change_of_faint(k, rows.of_unknowns(step))
         return self._pull(images, sources, self._rough)
@@ -389,8 +389,8 @@ def accurate_step(
     enough: float,
     *,
     volume: Tensor | float = 0.0,
-    iterations: int = _ITERATIONS,
-    sufficient: float = _SUFFICIENT,
+    iterations: int = _GRADIENT_ITERATIONS,
+    sufficient: float = _GRADIENT_TOLERANCE,
 ) -> tuple[Tensor, bool]:
     """Compute the step (unknowns,) to the minimum of the linearised penalised chi-squared.
 
@@ -407,7 +407,7 @@ def accurate_step(
     # Unknowns differ by many powers of ten, so the system is solved in scaled units.
     unit = (curvature.diagonal() + precision).clamp(min=1e-300) ** -0.5
     system = (curvature * unit[:, None]).mul_(unit)
-    system.diagonal().mul_(1 + _ROUNDING).add_(precision * unit**2)
+    system.diagonal().mul_(1 + _CURVATURE_ROUNDING).add_(precision * unit**2)
     factor = torch.linalg.cholesky(system)
     step = torch.zeros_like(offset)
 
@@ -431,8 +431,8 @@ def conjugate_gradients(
     precondition: Callable[[Tensor], Tensor],
     gradient: Tensor,
     enough: float = 0.0,
-    iterations: int = _ITERATIONS,
-    sufficient: float = _SUFFICIENT,
+    iterations: int = _GRADIENT_ITERATIONS,
+    sufficient: float = _GRADIENT_TOLERANCE,
 ) -> tuple[Tensor, bool]:
     """Minimise x A x - 2 g x approximately; also whether another iteration would hardly lower it.
 
@@ -471,16 +471,16 @@ def conjugate_gradients(
     return x, False
 
 
-_TRIES = 7
+_MOST_ATTEMPTS = 7
 """Largest number of attempts at a step, with increasing damping. The last attempt has a damping of
 2,300: what has a prior hardly moves any more."""
 
-_LEAST = 0.05
+_LEAST_DAMPING = 0.05
 """Smallest damping, as a multiple of the prior's precision. Less has no effect on a step."""
 
 _HARDER = 6.0
-"""Growth of the damping after an attempt that raised chi-squared: `_TRIES` attempts then span all
-dampings that matter, and each costs one image of every frame."""
+"""Growth of the damping after an attempt that raised chi-squared: `_MOST_ATTEMPTS` attempts then
+span all dampings that matter, and each costs one image of every frame."""
 
 _HARD = 2.5
 """Growth of the damping after a step that gained much less than predicted. Since the step did gain,
@@ -497,28 +497,28 @@ _AS_PREDICTED, _BELOW_PREDICTED = 0.7, 0.3
 grows. Between them the linear model is neither good nor bad, and the damping stays; trust-region
 methods have similar limits (Nocedal and Wright 2006, Numerical Optimization, algorithm 4.1)."""
 
-_RESPONSES = 4e9
+_RESPONSES_BYTES = 4e9
 """Largest number of bytes of stored derivatives."""
 
-_FINAL = 0.01
+_FINAL_DERIVATIVE_ERROR = 0.01
 """Largest error of the derivatives in the linear model that gives the errors of a fit. With 0.05,
 limits were up to 10 % too shallow near the occulter."""
 
-_FAR = 0.03
+_FAR_KAPPA = 0.03
 """Model error above which steps fail because they are large, and are damped."""
 
-_SIMILAR = 1.5
+_SIMILAR_KAPPA_RATIO = 1.5
 """Ratio of model errors above which normal equations precondition poorly."""
 
-_PARTS = (1.0, 0.4, 0.16, 0.064)
+_STEP_PARTS = (1.0, 0.4, 0.16, 0.064)
 """Parts of an accurate step that are tried until one lowers the penalised chi-squared."""
 
-_SLOW = 0.8
+_SLOW_GAIN_RATIO = 0.8
 """Ratio of the gains of successive steps with the same derivatives above which they are poor: with
 right ones, gains decrease tenfold. Near a companion of 0.1 of the star's flux, whose light depends
 on the wavefront as well, each gain was 0.9 of the one before."""
 
-_POOR = 0.5
+_POOR_GAIN_RATIO = 0.5
 """Ratio of the actual to the expected gain of a step below which its derivatives are poor."""
 
 
@@ -542,7 +542,7 @@ class StepState:
         if ratio > _AS_PREDICTED:
             return replace(self, damping=self.damping * _EASIER if self.damping > _NONE else 0.0)
         if ratio < _BELOW_PREDICTED:
-            return replace(self, damping=max(_HARD * self.damping, _LEAST))
+            return replace(self, damping=max(_HARD * self.damping, _LEAST_DAMPING))
         return self
 
 
@@ -620,7 +620,7 @@ class EquationsCache:
         if (
             last is not None
             and self._preconditions
-            and (last.kappa <= _SIMILAR * kappa or not last.has_weights)
+            and (last.kappa <= _SIMILAR_KAPPA_RATIO * kappa or not last.has_weights)
             and last.is_within(ACCURATE)
             and len(last.current) == state.unknowns.with_modes(modes)
         ):
@@ -646,7 +646,7 @@ class Solver:
     """
 
     def __init__(
-        self, problems: Sequence[Problem], settings: GaussNewton, basis: Basis, progress: bool
+        self, problems: Sequence[Problem], settings: FitSettings, basis: Basis, progress: bool
     ) -> None:
         self.settings, self.basis = settings, basis
         for problem in problems:
@@ -666,7 +666,7 @@ class Solver:
             wavelengths=settings.response_wavelengths,
             relinearise=settings.relinearise,
             keep=len(problems),
-            memory=min(_RESPONSES, settings.memory_beside(jacobians)),
+            memory=min(_RESPONSES_BYTES, settings.memory_beside(jacobians)),
             progress=progress,
         )
         self.objective = Objective(
@@ -674,7 +674,7 @@ class Solver:
         )
         self.equations = EquationsCache(self.objective, responses)
 
-    def priors_of(self, settings: GaussNewton) -> ModePriors:
+    def priors_of(self, settings: FitSettings) -> ModePriors:
         """The priors of the modes that settings state, for the frames of this fit."""
         observations = [forward.problem.observation for forward in self.objective.forwards]
         return ModePriors.of(settings, self.basis, observations)
@@ -694,14 +694,14 @@ class Solver:
         The state is unchanged if no step lowers the penalised chi-squared. The gain is the
         decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
-        needs_accurate = carried.needs_accurate and kappa <= carried.kappa and kappa < _FAR
+        needs_accurate = carried.needs_accurate and kappa <= carried.kappa and kappa < _FAR_KAPPA
         carried = replace(carried, kappa=kappa, needs_accurate=needs_accurate)
         # Without the wavefront, derivatives are cheap and always accurate.
         may_repeat = self.settings.accurate_steps and modes > 0
         if not (may_repeat and needs_accurate):
             taken, gain, carried = self._quick_step(state, carried, kappa, modes, may_repeat)
             # Only derivatives of the model itself can tell that no further step gains anything.
-            is_last = may_repeat and gain < self.settings.tolerance and kappa < _FAR
+            is_last = may_repeat and gain < self.settings.tolerance and kappa < _FAR_KAPPA
             if taken is not None and not is_last:
                 return Step(taken, gain, carried)
             carried = replace(carried, damping=0.0, needs_accurate=True)
@@ -733,7 +733,7 @@ class Solver:
             state, kappa, modes, objective.robust, self.settings.relinearise
         )
         # New derivatives that fail show that the model is not linear, as do large steps.
-        is_stale = may_repeat and not equations.is_exact and kappa < _FAR
+        is_stale = may_repeat and not equations.is_exact and kappa < _FAR_KAPPA
         noise = objective.errors(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else carried.damping
@@ -749,7 +749,7 @@ class Solver:
             # The gain is too small for another linearisation.
             return unmoved, expected / objective.pixels, carried
         before = self._cost(state, noise, priors)
-        for _ in range(_TRIES):
+        for _ in range(_MOST_ATTEMPTS):
             if carried.damping != damping:
                 damping = carried.damping
                 update = self._solve(unknowns, equations, priors, damping=damping)
@@ -758,13 +758,13 @@ class Solver:
             after = self._cost(trial, noise, priors)
             if after < before and trial.has_star:
                 ratio, gain = (before - after) / expected, (before - after) / objective.pixels
-                slow = _SLOW * carried.gain < gain < carried.gain
-                poor = is_stale and (ratio < _POOR or slow)
+                slow = _SLOW_GAIN_RATIO * carried.gain < gain < carried.gain
+                poor = is_stale and (ratio < _POOR_GAIN_RATIO or slow)
                 carried = replace(carried, needs_accurate=True) if poor else carried.relaxed(ratio)
                 return trial, gain, replace(carried, gain=gain)
             if is_stale:
                 return None, 0.0, carried
-            carried = replace(carried, damping=max(_HARDER * carried.damping, _LEAST))
+            carried = replace(carried, damping=max(_HARDER * carried.damping, _LEAST_DAMPING))
         return unmoved, 0.0, carried
 
     def _accurate_step(self, state: State, carried: StepState, kappa: float, modes: int) -> Step:
@@ -793,7 +793,7 @@ class Solver:
                 derivatives, equations.curvature, offset, deviation, enough, volume=volume
             )
             self.equations.judge(preconditions=settled)
-            for part in _PARTS:
+            for part in _STEP_PARTS:
                 trial = self._moved(state, part * step)
                 after = self._cost(trial, noise, carried.priors)
                 if after < before and trial.has_star:
@@ -855,7 +855,7 @@ class Solver:
         """Largest error of the derivatives in linear models, see `linear_model`."""
         if not self.settings.accurate_steps:
             return self.settings.relinearise
-        return _FINAL if final else ACCURATE
+        return _FINAL_DERIVATIVE_ERROR if final else ACCURATE
 
     def posterior(self, state: State, priors: ModePriors) -> EvidenceUpdate:
         """Return the errors of all unknowns of the last linear model, which is about `state`."""

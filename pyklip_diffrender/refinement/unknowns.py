@@ -22,15 +22,15 @@ from pyklip_diffrender.linear.model import FrameRows, Unknown
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.scene.objects import Planet
 
-_LINEAR = tuple(p.name for p in LEVELS)
+_LINEAR_NAMES = tuple(p.name for p in LEVELS)
 
-_BRIGHT = 1e-4
+_COUPLED_COMPANION_CONTRAST = 1e-4
 """Contrast of a companion whose light counts in the Jacobian by optics, flux and wavefront. A
 change of the wavefront by 10 nm moves 1 % of this light. Without its derivatives, companions of
 1e-3 have false candidates beside them, and errors of a S/N above 30 are too small. The derivatives
 take as long as the star's."""
 
-_OUTWEIGHED = 0.3
+_COUPLED_CONTRAST_OVER_ERROR = 0.3
 """Contrast over the error of the star's model below which the derivatives of a companion's light do
 not matter yet. Two rolls of G 7-34 need a fifth less memory without them. The last linear model has
 all of them."""
@@ -46,7 +46,9 @@ def brightest(sources: Tensor, kappa: float = 0.0) -> Tensor:
     """
     # One companion, because its derivatives take as long as the star's.
     first = sources[sources[:, 0].argsort(descending=True)[:1]]
-    return first[first[:, 0] > max(_BRIGHT, _OUTWEIGHED * kappa)]
+    return first[
+        first[:, 0] > max(_COUPLED_COMPANION_CONTRAST, _COUPLED_CONTRAST_OVER_ERROR * kappa)
+    ]
 
 
 @dataclass(frozen=True)
@@ -72,12 +74,12 @@ class FrameUnknowns:
     @property
     def optical(self) -> tuple[str, ...]:
         """Free parameters of the model."""
-        return tuple(name for name in self.names if name not in _LINEAR)
+        return tuple(name for name in self.names if name not in _LINEAR_NAMES)
 
     @property
     def linear(self) -> tuple[str, ...]:
         """Levels that are free, in the order of the parameter table."""
-        return tuple(name for name in _LINEAR if name in self.names)
+        return tuple(name for name in _LINEAR_NAMES if name in self.names)
 
     @property
     def ordered(self) -> tuple[str, ...]:
@@ -111,7 +113,7 @@ class FrameUnknowns:
 
     def values(self, vector: Tensor) -> dict[str, Tensor]:
         """All optical parameters as the model takes them."""
-        values = {name: value for name, value in self.start.items() if name not in _LINEAR}
+        values = {name: value for name, value in self.start.items() if name not in _LINEAR_NAMES}
         return {**values, **{name: vector[self.where(name)] for name in self.optical}}
 
     def level(self, name: str, vector: Tensor) -> float:
@@ -130,7 +132,7 @@ class FrameUnknowns:
 
     def are_bright(self, vector: Tensor) -> Tensor:
         """Mask of visible companions whose light depends noticeably on the wavefront, (k,)."""
-        return self.visible_sources(vector)[:, 0] > _BRIGHT
+        return self.visible_sources(vector)[:, 0] > _COUPLED_COMPANION_CONTRAST
 
     def bright_sources(self, vector: Tensor, kappa: float = 0.0) -> Tensor:
         """Companions whose light counts in the Jacobian by the star, (k, 3), see `brightest`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pyklip_diffrender.scene.aligned_frames import shift_frames
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.integrations import calibrated_errors
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.objects import (
@@ -15,7 +16,7 @@ from pyklip_diffrender.scene.objects import (
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import world_coordinates
-from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 from pyklip_diffrender.scene.simulation import (
     expected_photons,
     model_for,
@@ -23,19 +24,18 @@ from pyklip_diffrender.scene.simulation import (
     simulate,
     star_photons,
 )
-from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = [
     "ALPHA_PICTORIS_W2",
     "BAD_PIXEL_BITS",
     "PAPER_SEGMENT_GAP",
     "UNOCCULTED_PEAK",
+    "DetectorPattern",
+    "ExposureSequence",
     "Observation",
     "Planet",
     "Scene",
-    "Sequence",
     "Star",
-    "Systematics",
     "calibrated_errors",
     "expected_photons",
     "model_for",

@@ -24,9 +24,9 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.pixel_checks import copies, why_other_brightness, why_turned
 
 EPOCH = 5.0
-"""Days between frames that may share a wavefront map."""
+"""Days between frames that may share an OPD map."""
 
-_TWO_STARS = 1.0
+_TWO_STARS_ARCSEC = 1.0
 """arcsec between two stars of different names on one date, beyond which they are not one star."""
 
 _USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
@@ -391,7 +391,7 @@ def _are_two_stars(one: Exposure, other: Exposure) -> bool:
     This tells the stars of a binary; between epochs, coordinates of one star may differ by more.
     """
     apart = one.star.separation(other.star)
-    if apart is None or apart <= _TWO_STARS or not (one.star.names and other.star.names):
+    if apart is None or apart <= _TWO_STARS_ARCSEC or not (one.star.names and other.star.names):
         return False
     if any(other.star.is_called(name) for name in one.star.names):
         return False

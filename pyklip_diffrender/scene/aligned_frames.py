@@ -28,43 +28,43 @@ _log = logging.getLogger(__name__)
 SHIFTS = ("IMSHIFTS", "CENTER_SHIFT", "ALIGN_SHIFT")
 """Extensions in which spaceKLIP records shifts: the first until release 2.1, the others since."""
 
-_PAD = 5
+_PAD_PIXELS = 5
 """Rows and columns that are mirrored at every edge before a shift, as many as in the alignment."""
 
-_SIDE = 2048
+_SIDE_PIXELS = 2048
 """Rows and columns of a detector."""
 
-_NEAR = 50.0
+_STAR_FROM_MASK_PIXELS = 50.0
 """Pixels from the mask to a star, beyond which header and mask contradict each other: the start of
 another subarray is hundreds of pixels away."""
 
-_OVERHANG = 5
+_OVERHANG_PIXELS = 5
 """Pixels by which a shift may move an array over the edge of the detector."""
 
-_REACH = 4
+_REACH_PIXELS = 4
 """Pixels about a gap from which it is filled."""
 
-_RESOLUTION = 1.1
+_AUTOCORRELATION_SIGMA_PIXELS = 1.1
 """Standard deviation of the Gaussian autocorrelation of images in filled gaps, pixels, as for a
 point source at 4 microns."""
 
-_NUGGET = 1e-3
+_NUGGET_VARIANCE_RATIO = 1e-3
 """Noise of the pixels relative to the image's variance, which keeps the equations regular."""
 
-_BESIDE = 2.3
+_BESIDE_GAP_PIXELS = 2.3
 """Pixels from a gap within which known pixels are predicted, to see how good predictions are."""
 
-_DOUBT = 0.25
+_FILLED_VARIANCE_RATIO = 0.25
 """Largest variance that filled pixels may add, relative to the variance of the pixel."""
 
-_PART = 0.1
+_MASKED_GAP_WEIGHT = 0.1
 """Squared weight of a gap above which a pixel is masked, however well it was filled."""
 
-_MISPLACED = 0.3
+_MISPLACED_STAR_PIXELS = 0.3
 """Pixels between a star and its stated position beyond which the position may be wrong by a pixel:
 the star is measured to a tenth of a pixel, and is within 0.2 pixel of the mask."""
 
-_CROPPED = 32
+_CROPPED_PIXELS = 32
 """Whole pixels beyond which frames were cropped, and not only aligned."""
 
 SAME_PLACE_PIXELS = 0.02
@@ -154,7 +154,7 @@ def first_pixel(
     if header_text(header, "SUBARRAY", name) is None:
         mask = None  # A subarray that is not named may begin anywhere.
     away = 0.0 if mask is None else float(np.abs(np.add(star, (column, row)) - mask).max())
-    if away > _NEAR or not on_detector((column, row), shape):
+    if away > _STAR_FROM_MASK_PIXELS or not on_detector((column, row), shape):
         _log.warning(
             "%s: with SUBSTRT1 and SUBSTRT2 of %d and %d the star at (%.1f, %.1f) is not where the "
             "mask is on the detector; the place of the frames is not known",
@@ -167,7 +167,7 @@ def first_pixel(
 def on_detector(first: tuple[int, int], shape: tuple[int, ...]) -> bool:
     """Whether an array is on the detector, up to a few pixels by which it may have been moved."""
     ends = np.add(first, shape[::-1])
-    return bool(min(first) >= -_OVERHANG and ends.max() <= _SIDE + _OVERHANG)
+    return bool(min(first) >= -_OVERHANG_PIXELS and ends.max() <= _SIDE_PIXELS + _OVERHANG_PIXELS)
 
 
 def undo_shifts(
@@ -191,7 +191,7 @@ def undo_shifts(
     del pairs  # The pairs are as large as the frames.
     gaps = _spread((missing | unknown).astype(float), shifts)
     variance = shift_variances(error, ~unknown, shifts)
-    valid = (leaked < _DOUBT * variance) & (gaps < _PART)
+    valid = (leaked < _FILLED_VARIANCE_RATIO * variance) & (gaps < _MASKED_GAP_WEIGHT)
     return moved, np.sqrt(variance + leaked), valid
 
 
@@ -228,22 +228,23 @@ def filled(
     doubt[gaps] = typical[gaps]
     for row, column in np.argwhere(gaps):
         window = np.s_[
-            max(row - _REACH, 0) : row + _REACH + 1, max(column - _REACH, 0) : column + _REACH + 1
+            max(row - _REACH_PIXELS, 0) : row + _REACH_PIXELS + 1,
+            max(column - _REACH_PIXELS, 0) : column + _REACH_PIXELS + 1,
         ]
         y, x = np.nonzero(~gaps[window])
         y, x = y + window[0].start - row, x + window[1].start - column
-        near = np.hypot(x, y) < _REACH + 0.5
+        near = np.hypot(x, y) < _REACH_PIXELS + 0.5
         y, x = y[near], x[near]
         # On all sides; what lies beyond the edge of a large gap is not interpolated.
         if min(x.max(initial=-9), y.max(initial=-9), -x.min(initial=9), -y.min(initial=9)) < 1:
             continue
         values = frame[y + row, x + column]
         distances = np.hypot(x - x[:, None], y - y[:, None])
-        inverse = np.linalg.inv(_covariance(distances) + _NUGGET * np.eye(len(x)))
+        inverse = np.linalg.inv(_covariance(distances) + _NUGGET_VARIANCE_RATIO * np.eye(len(x)))
         mean = values.mean()
         excess = inverse @ (values - mean)
         image[row, column] = mean + _covariance(np.hypot(x, y)) @ excess
-        left_out = (excess / np.diag(inverse))[np.hypot(x, y) < _BESIDE]
+        left_out = (excess / np.diag(inverse))[np.hypot(x, y) < _BESIDE_GAP_PIXELS]
         doubt[row, column] = (
             np.sqrt((left_out**2).mean()) if len(left_out) else typical[row, column]
         )
@@ -251,7 +252,7 @@ def filled(
 
 
 def _covariance(distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.exp(-0.5 * (distance / _RESOLUTION) ** 2))
+    return np.asarray(np.exp(-0.5 * (distance / _AUTOCORRELATION_SIGMA_PIXELS) ** 2))
 
 
 def _nearest(image: NDArray[np.float64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -280,10 +281,10 @@ def _spread(squares: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArra
 
 def shift_frames(frames: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
     """Fourier-shift frames (frames, ny, nx), without NaN, by x, y in pixels, (frames, 2)."""
-    inner = slice(_PAD, -_PAD)
+    inner = slice(_PAD_PIXELS, -_PAD_PIXELS)
     shifted = np.empty_like(frames)
     for k, (frame, (x, y)) in enumerate(zip(frames, shifts, strict=True)):
-        padded = np.pad(frame, _PAD, mode="reflect")
+        padded = np.pad(frame, _PAD_PIXELS, mode="reflect")
         moved = np.fft.ifft2(fourier_shift(np.fft.fft2(padded), (y, x))).real
         shifted[k] = moved[inner, inner]
     return shifted
@@ -334,7 +335,7 @@ def on_detector_pixels(
     net = net_shifts(shifts, center, mask)
     pixels = np.round(net.mean(axis=0))
     # The alignment leaves the flags where they were; a crop takes them along.
-    cropped = np.abs(pixels).max() > _CROPPED
+    cropped = np.abs(pixels).max() > _CROPPED_PIXELS
     right, up = (int(each) for each in (np.round(shifts.mean(axis=0)) if cropped else pixels))
     for k in range(frames):
         part = slice(k, k + 1)
@@ -353,7 +354,7 @@ def on_detector_pixels(
         frame = data[0].astype(float), error[0].astype(float), usable[0]
         scale = float(np.mean(arguments["pixelscale"]))
         away = measured_offset(*frame, (center + pixels - net)[0], scale)
-        if away is not None and np.abs(away).max() > _MISPLACED:
+        if away is not None and np.abs(away).max() > _MISPLACED_STAR_PIXELS:
             _log.warning(
                 "%s: the star is %.1f, %.1f pixels (x, y) from its stated position, so that the "
                 "place of the frames on the detector is not known",

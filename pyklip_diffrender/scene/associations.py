@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 Role = Literal["science", "psf"]
 """Role of a member of an association: the target, or a reference star."""
 
-_SUFFIX = ".json"
+_ASSOCIATION_SUFFIX = ".json"
 """Suffix of association files, in any case."""
 
 
@@ -66,7 +66,7 @@ def listed_files(
         if not isinstance(entry, str | os.PathLike):
             raise IncompatibleSetupError(
                 f"files: got a {type(entry).__name__}, expected paths of FITS files or folders. "
-                "Frames in memory go into a Sequence: Sequence(target, (frame, ...))"
+                "Put frames in memory into an ExposureSequence(target, (frame, ...))"
             )
         found = matches(Path(entry))
         if not found:
@@ -79,7 +79,7 @@ def listed_files(
                 if any(path.glob("*_asn.json")):
                     _log.info("%s: its association files are not read; give one by name", path)
                 listed += map(ListedFile, inside)
-            elif path.suffix.lower() == _SUFFIX:
+            elif path.suffix.lower() == _ASSOCIATION_SUFFIX:
                 for member in _members(path):
                     roles.setdefault(member.path, set()).add(member.role)
                     if member not in listed:  # Usually, several associations have it.

@@ -39,10 +39,15 @@ _LEVELS = (
 )  # fmt: skip
 """Products of the pipeline, the usable ones first, and of these the best first."""
 
-_STEPS = {"S_KLIP": "psfsub", "S_PSFALI": "psfalign", "S_PSFSTK": "psfstack", "S_RESAMP": "i2d"}
+_STEPS_BEYOND_DETECTOR = {
+    "S_KLIP": "psfsub",
+    "S_PSFALI": "psfalign",
+    "S_PSFSTK": "psfstack",
+    "S_RESAMP": "i2d",
+}
 """Steps of the pipeline after which frames no longer have a detector's own pixels."""
 
-_NAME = re.compile(
+_ARCHIVE_NAME = re.compile(
     r"jw(\d{5})(\d{3})(\d{3})_(\d{2})(\d)(\w{2})_(\d{5})(?:-seg(\d{3}))?_([a-z0-9]+)", re.IGNORECASE
 )
 """Programme, observation, visit, visit group, parallel sequence, activity, exposure, segment and
@@ -56,7 +61,7 @@ _DETECTORS = {"NRCA5": "NRCALONG", "NRCB5": "NRCBLONG"}
 
 def level_of(header: fits.Header, name: str, dimensions: int) -> str | None:
     """Product of the pipeline, from its steps, the unit, and the names of the file."""
-    for key, level in _STEPS.items():
+    for key, level in _STEPS_BEYOND_DETECTOR.items():
         if str(header.get(key, "")).strip().upper() == "COMPLETE":
             return level
     texts = (Path(name).name, header_text(header, "FILENAME", name) or "")
@@ -80,7 +85,7 @@ def detector_of(header: fits.Header, name: str) -> str | None:
     aperture = (header_text(header, "APERNAME", name) or "").upper().partition("_")[0]
     if re.fullmatch(r"NRC[AB]\d", aperture):
         return _DETECTORS.get(aperture, aperture)
-    match = _NAME.search(Path(name).name)
+    match = _ARCHIVE_NAME.search(Path(name).name)
     return match[9].upper() if match else None
 
 
@@ -99,7 +104,7 @@ def identity_of(header: fits.Header, name: str) -> str | None:
         segment = header_number(header, "EXSEGNUM", name) or 1
         return _identified(digits, f"{segment:03.0f}", detector)
     for text in (header_text(header, "FILENAME", name) or "", Path(name).name):
-        match = _NAME.search(text)
+        match = _ARCHIVE_NAME.search(text)
         if match:
             *digits, part, chip = match.groups()
             return _identified(digits, part or "001", chip)
@@ -120,21 +125,21 @@ def _identified(digits: list[str], segment: str, detector: str) -> str:
 _COORDINATES: tuple[tuple[str, str], ...] = (("TARG_RA", "TARG_DEC"), ("RA_REF", "DEC_REF"))
 """Cards of the star's coordinates, and of where the telescope pointed."""
 
-_SAME_PLACE = 5.0
+_SAME_STAR_ARCSEC = 5.0
 """arcsec between the coordinates of one star in two headers, at one epoch."""
 
-_SAME_POINTING = 60.0
+_SAME_POINTING_ARCSEC = 60.0
 """arcsec between the coordinates of one star if its names agree, or if one of the two is where the
 telescope pointed."""
 
-_FASTEST = 11.0
+_FASTEST_ARCSEC_YR = 11.0
 """arcsec per year that no star exceeds: Barnard's star moves by 10.4."""
 
-_SAME_MOTION = 0.01
+_SAME_ARCSEC_YR = 0.01
 """arcsec per year by which the proper motions of one star in two headers may differ. Catalogues
 agree to a few milliarcseconds, and a background source is measured to about ten."""
 
-_OLDEST = 2000.0
+_OLDEST_COORDINATES_YEAR = 2000.0
 """Julian year of the oldest coordinates in proposals: coordinates of the equinox J2000."""
 
 
@@ -166,7 +171,7 @@ class CatalogueStar:
         """
         if self.coordinates is None or other.coordinates is None:
             return None
-        year = max((*self.epochs, *other.epochs), default=_OLDEST)
+        year = max((*self.epochs, *other.epochs), default=_OLDEST_COORDINATES_YEAR)
         one, two = self._places(year, other.motion), other._places(year, self.motion)
         apart = angular_separation(*one[:, :, None], *two[:, None])
         return float(np.rad2deg(apart.min()) * 3600)
@@ -175,7 +180,7 @@ class CatalogueStar:
         """RA and Dec in radians in a year, (2, epochs); `motion` is used if the star has none."""
         east, north = self.motion or motion or (0.0, 0.0)
         rate = np.deg2rad(np.hypot(east, north) / 3600)
-        years = year - np.array(self.epochs or (_OLDEST, year))
+        years = year - np.array(self.epochs or (_OLDEST_COORDINATES_YEAR, year))
         place = np.deg2rad(self.coordinates or (0.0, 0.0))
         moved = offset_by(*place, np.arctan2(east, north), rate * years)
         return np.array([each.radian for each in moved])
@@ -187,11 +192,11 @@ class CatalogueStar:
         if apart is None:
             return alike
         coarse = alike or self.pointing or other.pointing
-        limit = _SAME_POINTING if coarse else _SAME_PLACE
+        limit = _SAME_POINTING_ARCSEC if coarse else _SAME_STAR_ARCSEC
         if alike and self.motion is None and other.motion is None:
             # As far as a star may have moved since the epoch of a catalogue.
-            latest = max((*self.epochs, *other.epochs), default=_OLDEST)
-            limit = max(limit, _FASTEST * (latest - _OLDEST))
+            latest = max((*self.epochs, *other.epochs), default=_OLDEST_COORDINATES_YEAR)
+            limit = max(limit, _FASTEST_ARCSEC_YR * (latest - _OLDEST_COORDINATES_YEAR))
         return apart < limit
 
 
@@ -199,7 +204,7 @@ def star_of(header: fits.Header, name: str) -> CatalogueStar:
     """Read which star a header names, and where it is."""
     names = [header_text(header, key, name) for key in ("TARGPROP", "TARGNAME")]
     motion = _motion(header, name)
-    if motion is not None and np.hypot(*motion) > _FASTEST:
+    if motion is not None and np.hypot(*motion) > _FASTEST_ARCSEC_YR:
         motion = None
     date, since = beginning(header, name), catalogue_epoch(header, name)
     epochs = [] if date is None else [float(date.jyear)]
@@ -212,7 +217,7 @@ def star_of(header: fits.Header, name: str) -> CatalogueStar:
                 raise card_error(name, keys[1], dec, "a declination in degrees")
             pointing = keys != _COORDINATES[0]
             if not pointing:
-                epochs.insert(0, _OLDEST if since is None else float(since.jyear))
+                epochs.insert(0, _OLDEST_COORDINATES_YEAR if since is None else float(since.jyear))
             return CatalogueStar(
                 tuple(filter(None, names)), (ra, dec), pointing, motion, tuple(epochs)
             )
@@ -241,11 +246,11 @@ def proper_motion(header: fits.Header, name: str) -> tuple[float, float] | None:
     CorruptFileError if no star moves as fast.
     """
     motion = _motion(header, name)
-    if motion is not None and np.hypot(*motion) > _FASTEST:
+    if motion is not None and np.hypot(*motion) > _FASTEST_ARCSEC_YR:
         raise CorruptFileError(
             f"{name}: MU_RA and MU_DEC are {motion[0]:g} and {motion[1]:g}, expected arcsec per "
-            f"year, less than {_FASTEST:g} in all. If these are milliarcseconds, divide them by "
-            "1000 in the header"
+            f"year, less than {_FASTEST_ARCSEC_YR:g} in all. If these are milliarcseconds, divide "
+            "them by 1000 in the header"
         )
     return motion
 
@@ -262,11 +267,11 @@ def common_motion(headers: Iterable[tuple[fits.Header, str]]) -> tuple[float, fl
         if (motion := proper_motion(header, name)) is not None
     ]
     for (first, one), (second, other) in combinations(known, 2):
-        if np.hypot(*np.subtract(one, other)) > _SAME_MOTION:
+        if np.hypot(*np.subtract(one, other)) > _SAME_ARCSEC_YR:
             raise IncompatibleSetupError(
                 f"the headers disagree on the star's proper motion (MU_RA, MU_DEC, arcsec per "
                 f"year): got {one[0]:g}, {one[1]:g} in {first} and {other[0]:g}, {other[1]:g} in "
-                f"{second}, expected the same to {_SAME_MOTION:g}. Correct the headers, or give "
+                f"{second}, expected the same to {_SAME_ARCSEC_YR:g}. Correct the headers, or give "
                 "the motion as proper_motion (--proper-motion)"
             )
     if not known:
@@ -283,13 +288,13 @@ _MASK = re.compile(r"(?<![A-Z0-9])(?:SUB\d+|MASK)?[AB]?(?:MASK)?(\d{3}R|LWB|SWB)
 _MODULE = re.compile(r"(?:NRC|MASK|SUB\d+)?([AB])(?=\d|[LS]WB|LONG|$)")
 """NIRCam's module in a detector (NRCALONG), MODULE (A), CORONMSK or SUBARRAY."""
 
-_SAME_ANGLE = 0.1
+_SAME_ANGLE_DEG = 0.1
 """Degrees by which the sum of two angles may differ from the sum in a card."""
 
-_LONGEST = 2.0
+_LONGEST_HALF_EXPOSURE_DAYS = 2.0
 """Days from the beginning of an exposure to its middle, or to the midnight before."""
 
-_LAUNCH = 59573.0
+_LAUNCH_MJD = 59573.0
 """Modified Julian date of the launch of JWST, 2021-12-25."""
 
 
@@ -439,7 +444,7 @@ def position_angle(header: fits.Header, name: str) -> float | None:
         return None if total is None else full_circle(total)
     # -1 for every detector of JWST, in which x goes opposite to V2.
     turned = roll - angle * (-1.0 if parity is None else parity)
-    if total is not None and abs(half_circle(turned - total)) > _SAME_ANGLE:
+    if total is not None and abs(half_circle(turned - total)) > _SAME_ANGLE_DEG:
         raise card_error(name, "PA_APER", total, f"{turned:.3f}, by ROLL_REF and V3I_YANG")
     return full_circle(turned)
 
@@ -458,7 +463,7 @@ def beginning(header: fits.Header, name: str) -> Time | None:
             date = Time(start, format="mjd", scale="utc")
         else:
             date = header_date(header, ("DATE-OBS",), name)
-    if date is not None and date.mjd < _LAUNCH:
+    if date is not None and date.mjd < _LAUNCH_MJD:
         raise CorruptFileError(
             f"{name}: the exposure began on {date.iso[:10]} by the header, before the launch of "
             "JWST. Correct DATE-BEG, DATE-OBS or EXPSTART, or fetch the file again"
@@ -475,7 +480,7 @@ def middle(header: fits.Header, name: str) -> Time | None:
     if not day:
         return None
     start = beginning(header, name)
-    if start is not None and abs(day - start.mjd) > _LONGEST:
+    if start is not None and abs(day - start.mjd) > _LONGEST_HALF_EXPOSURE_DAYS:
         raise card_error(name, "EXPMID", day, f"about {start.mjd:.2f}, when the exposure began")
     return Time(day, format="mjd", scale="utc")
 

@@ -27,7 +27,7 @@ from pyklip_diffrender.scene.pixel_checks import (
 _SENSED = "RESULT_PHASE"
 """Extension of wavefront-sensing files of MAST."""
 
-_MAP = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd"
+_MAP = "it is an OPD map, no frame of a star; OPD maps are given as opd"
 
 
 @dataclass(frozen=True, eq=False)

@@ -173,43 +173,43 @@ def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> ND
 Stack = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_AT_ONCE = 2**18
+_PIXELS_AT_A_TIME = 2**18
 """Largest number of pixels in one call of the median, which bounds its memory."""
 
-_FEW = 3
+_FEWEST_INTEGRATIONS = 3
 """Number of integrations below which none can be told from the others."""
 
-_BRIGHT = 10.0
+_STARLIT_PIXEL_SNR = 10.0
 """S/N of the pixels that show how bright the star is."""
 
-_FACTOR = 0.15
+_BRIGHTNESS_DEVIATION = 0.15
 """Deviation of the star's brightness from the median that jitter does not explain."""
 
-_JITTER = 0.05
+_JITTER_PIXELS = 0.05
 """Pixels by which the star may move between integrations."""
 
-_CHANGE = 0.03
+_INTEGRATION_FLUX_CHANGE = 0.03
 """Fraction by which the star's light may change from one integration to the next."""
 
-_PATCH = 5
+_PATCH_PIXELS = 5
 """Side of the squares in which smooth deviations are looked for, pixels."""
 
-_SMOOTH, _SINGLE = 6.0, 8.0
+_PATCH_OUTLIER_SIGMAS, _PIXEL_OUTLIER_SIGMAS = 6.0, 8.0
 """Deviations of a square and of a pixel, in standard deviations, above which they are masked."""
 
-_NEAR = 3.0
+_MASKED_PIXELS_ARCSEC = 3.0
 """arcsec from the star within which the masked pixels of an integration are counted."""
 
-_MOST = 0.25
+_MASKED_PIXELS_SHARE = 0.25
 """Share of masked pixels above which an integration is left out."""
 
 
-_SAME_PLACE = 0.3
+_SAME_STAR_PIXELS = 0.3
 """Pixels between the stars of frames that are averaged: a planet is then blurred by less than
 a tenth of its width. Positions in aligned files were measured for each integration, to a tenth of
 a pixel or so; a tighter rule would take their errors for pointings of their own."""
 
-_SAME_ANGLE = 0.05
+_SAME_ROLL_DEG = 0.05
 """Degrees between frames that are averaged: a tenth of a pixel 7 arcsec from the star."""
 
 
@@ -277,7 +277,7 @@ def judge_integrations(
             )
     group = group[kept[group]]
     # A single row or column has no slopes.
-    if len(group) < _FEW or min(data.shape[1:]) < 2:
+    if len(group) < _FEWEST_INTEGRATIONS or min(data.shape[1:]) < 2:
         return Judgement(kept, tuple(remarks))
     # The star may move by a twentieth of a pixel between integrations and its light change by 3 %.
     # Larger deviations that are significant are masked; an integration is left out if they are a
@@ -286,15 +286,17 @@ def judge_integrations(
     median = _median(data, valid, group)
     rows, columns = np.indices(median.shape)
     x, y = center[group].mean(axis=0)
-    near = np.hypot((columns - x) * pixelscale[0], (rows - y) * pixelscale[1]) < _NEAR
+    near = (
+        np.hypot((columns - x) * pixelscale[0], (rows - y) * pixelscale[1]) < _MASKED_PIXELS_ARCSEC
+    )
     # A star that moves by d changes a pixel by its slope times d.
     slopes = np.hypot(*np.gradient(median))
-    allowed = _JITTER * slopes + _CHANGE * np.abs(median)
+    allowed = _JITTER_PIXELS * slopes + _INTEGRATION_FLUX_CHANGE * np.abs(median)
     for k in group:
         frame, sigma = data[k].astype(float), error[k].astype(float)
         usable, name = valid[k], names[k]
         scale = _brightness(frame, median, sigma, usable & near)
-        if abs(scale - 1) > _FACTOR:
+        if abs(scale - 1) > _BRIGHTNESS_DEVIATION:
             kept[k] = False
             remarks.append(
                 f"{name} is left out: its star is {scale:.2f} times as "
@@ -303,15 +305,15 @@ def judge_integrations(
             continue
         deviating = _deviating(frame - median, sigma, usable, allowed)
         share = float((deviating & near).sum() / max(1, (usable & near).sum()))
-        if share > _MOST:
+        if share > _MASKED_PIXELS_SHARE:
             kept[k] = False
             remarks.append(
                 f"{name} is left out: {share:.0%} of its pixels within "
-                f"{_NEAR:g} arcsec of the star deviate from the median of all"
+                f"{_MASKED_PIXELS_ARCSEC:g} arcsec of the star deviate from the median of all"
             )
         elif deviating.any():
             usable &= ~deviating
-            if deviating.sum() > _PATCH**2:
+            if deviating.sum() > _PATCH_PIXELS**2:
                 remarks.append(
                     f"{name}: {int(deviating.sum())} pixels that deviate "
                     "from the median of all are masked"
@@ -344,7 +346,7 @@ def judge_pointings(
 def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
     """Median of the valid pixels of some frames, (ny, nx); 0 where there are none."""
     median = np.zeros(data.shape[1:])
-    rows = max(1, _AT_ONCE // (len(group) * data.shape[2]))
+    rows = max(1, _PIXELS_AT_A_TIME // (len(group) * data.shape[2]))
     for first in range(0, len(median), rows):
         part = slice(first, first + rows)
         # Masked pixels are sorted to the end, so that the median of the valid ones is the mean of
@@ -362,7 +364,7 @@ def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
 def _brightness(frame: Stack, median: Stack, sigma: Stack, usable: Mask) -> float:
     """Ratio of the star's brightness in a frame and in the median; 1 if the star is not seen."""
     # sum of (frame - a median)^2 is minimal at a = sum of frame median / sum of median^2.
-    bright = usable & (median > _BRIGHT * sigma)
+    bright = usable & (median > _STARLIT_PIXEL_SNR * sigma)
     norm = float((median[bright] ** 2).sum())
     return float((frame[bright] * median[bright]).sum() / norm) if norm > 0 else 1.0
 
@@ -374,17 +376,17 @@ def _deviating(difference: Stack, sigma: Stack, usable: Mask, allowed: Stack) ->
     # Stated errors may be too small.
     scatter = median_abs_deviation((difference / sigma)[usable], scale="normal")
     noise = sigma * max(1.0, float(scatter))
-    single = excess > _SINGLE * noise
-    area = _PATCH**2
-    total = uniform_filter(difference * weight, _PATCH, mode="constant") * area
-    tolerated = uniform_filter(allowed * weight, _PATCH, mode="constant") * area
-    variance = uniform_filter(noise**2 * weight, _PATCH, mode="constant") * area
+    single = excess > _PIXEL_OUTLIER_SIGMAS * noise
+    area = _PATCH_PIXELS**2
+    total = uniform_filter(difference * weight, _PATCH_PIXELS, mode="constant") * area
+    tolerated = uniform_filter(allowed * weight, _PATCH_PIXELS, mode="constant") * area
+    variance = uniform_filter(noise**2 * weight, _PATCH_PIXELS, mode="constant") * area
     spread = np.sqrt(np.where(variance > 0, variance, np.inf))
     # Noise that neighbouring pixels share, such as 1/f noise, adds up in squares.
     shared = median_abs_deviation((total / spread)[usable], scale="normal")
     spread *= max(1.0, float(shared))
-    smooth = np.abs(total) - tolerated > _SMOOTH * spread
-    reach = np.ones((_PATCH, _PATCH), dtype=bool)
+    smooth = np.abs(total) - tolerated > _PATCH_OUTLIER_SIGMAS * spread
+    reach = np.ones((_PATCH_PIXELS, _PATCH_PIXELS), dtype=bool)
     return np.asarray(usable & (single | binary_dilation(smooth, reach)))
 
 
@@ -402,7 +404,7 @@ def pointings(center: Stack, angles: NDArray[np.float64] | None) -> Iterator[NDA
         first = int(np.argmax(left))
         apart = np.hypot(*(center - center[first]).T)
         turned = np.abs(half_circle(turns - turns[first]))
-        group = left & (apart <= _SAME_PLACE) & (turned <= _SAME_ANGLE)
+        group = left & (apart <= _SAME_STAR_PIXELS) & (turned <= _SAME_ROLL_DEG)
         left &= ~group
         yield np.flatnonzero(group)
 
@@ -417,24 +419,24 @@ _log = logging.getLogger(__name__)
 
 Image = NDArray[np.float64]
 
-_FAR = 6.0
+_STARLIGHT_NOISE_ARCSEC = 6.0
 """arcsec from the star beyond which its light adds no noise. Closer in, a bright star's light still
 shows in differences of neighbouring pixels."""
 
-_ENOUGH = 2000
+_FEWEST_FAR_PIXELS = 2000
 """Number of far pixels below which the errors are left as they are."""
 
-_PLAUSIBLE = (0.1, 5.0)
+_PLAUSIBLE_SCATTER_RATIO = (0.1, 5.0)
 """Ratios of scatter and errors beyond which the errors belong to other pixels. The ratio was 0.4 to
 1.2 in the real frames at hand."""
 
-_SMOOTHED = 15
+_DARK_BOX_PIXELS = 15
 """Side of the squares, pixels, whose mean light tells which parts of a frame are dark."""
 
-_STARLIT = 4.0
+_STARLIT_BOX_SIGMAS = 4.0
 """Standard deviations from the median of the mean lights above which a part is not dark."""
 
-_DARKEST = 0.25
+_DARK_PIXELS_SHARE = 0.25
 """Least share of the far pixels that is taken as dark, in a field that is full of sources."""
 
 _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
@@ -519,21 +521,23 @@ def dark_pixels(frame: Image, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     median = np.median(frame[usable])
     limit = 5 * median_abs_deviation(frame[usable], scale="normal")
     clipped = np.where(usable, np.clip(frame - median, -limit, limit), 0.0)
-    weight = uniform_filter(usable.astype(float), _SMOOTHED, mode="constant")
-    smooth = uniform_filter(clipped, _SMOOTHED, mode="constant") / np.maximum(weight, 1e-3)
+    weight = uniform_filter(usable.astype(float), _DARK_BOX_PIXELS, mode="constant")
+    smooth = uniform_filter(clipped, _DARK_BOX_PIXELS, mode="constant") / np.maximum(weight, 1e-3)
     values = smooth[usable]
     middle = float(np.median(values))
     below = middle - values[values <= middle]
     # 0.6745 is the median of |x| for a normal x of variance 1.
     # The scatter of the darker half, which sources do not reach.
     spread = float(np.median(below)) / 0.6745
-    threshold = max(middle + _STARLIT * spread, float(np.quantile(values, _DARKEST)))
+    threshold = max(
+        middle + _STARLIT_BOX_SIGMAS * spread, float(np.quantile(values, _DARK_PIXELS_SHARE))
+    )
     return usable & (smooth <= threshold)
 
 
 def why_odd_noise(ratios: Iterable[float]) -> str:
     """Why errors with the ratios of `calibrated_errors` are not the pixels', or an empty text."""
-    low, high = _PLAUSIBLE
+    low, high = _PLAUSIBLE_SCATTER_RATIO
     for ratio in ratios:
         if np.isfinite(ratio) and not low < ratio < high:
             return (
@@ -559,8 +563,8 @@ def _measured(
         away = np.hypot((x - center[k, 0]) * pixelscale[0], (y - center[k, 1]) * pixelscale[1])
         # A pixel is compared only where all of its neighbours are usable.
         complete = convolve(usable.astype(float), _NEIGHBOURS, mode="constant") > 0.99
-        far = dark_pixels(frame, usable & complete & (away > _FAR))
-        if far.sum() < _ENOUGH:
+        far = dark_pixels(frame, usable & complete & (away > _STARLIGHT_NOISE_ARCSEC))
+        if far.sum() < _FEWEST_FAR_PIXELS:
             yield np.nan, np.nan
             continue
         # The difference x - (a + b + c + d) / 4 has the variance s_x^2 + (s_a^2 + s_b^2 + s_c^2 +

@@ -46,7 +46,7 @@ may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
 BEHIND_THE_MASK = 0.1
 """Largest dither, arcsec, that leaves a star behind the mask; small-grid dithers are of 0.02."""
 
-_SCALES = (0.031, 0.063)
+_PIXEL_SCALES_ARCSEC = (0.031, 0.063)
 """arcsec of a pixel of NIRCam's short-wave and long-wave detectors, to 2 %."""
 
 
@@ -222,7 +222,7 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
         raise card_error(name, "PIXAR_SR", solid, f"about {by_area:.3g} sr, by PIXAR_A2")
     detector = detector_of(header, name) or ""
     if detector.startswith("NRC"):
-        usual = _SCALES[detector.endswith(("LONG", "5"))]
+        usual = _PIXEL_SCALES_ARCSEC[detector.endswith(("LONG", "5"))]
         if not 0.9 < area**0.5 / usual < 1.1:
             expected = f"about {usual**2:.2g} arcsec^2, the area of a pixel of {detector}"
             raise card_error(name, "PIXAR_A2", area, expected)

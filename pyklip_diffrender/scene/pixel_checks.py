@@ -23,48 +23,48 @@ from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symm
 
 Image = NDArray[np.float64]
 
-_CORE = 1.0
+_CORE_ARCSEC = 1.0
 """Radius, arcsec, in which the light of a star behind a mask is summed."""
 
-_SOFT = 0.2
+_EDGE_ARCSEC = 0.2
 """Half of the width, arcsec, of the edge of the circle in which light is summed."""
 
-_BEHIND = 0.5
+_SYMMETRY_OFFSET_ARCSEC = 0.5
 """Largest distance, arcsec, of the pattern's centre of symmetry from where the star should be. This
 is measured to half a pixel; stars are put behind the mask to .02 arcsec, and headers may be wrong
 by a few pixels. Half of a star's light passes a mask at 0.4 to 0.8 arcsec from its centre."""
 
-_PATTERN_BEHIND = 0.25
+_PATTERN_OFFSET_ARCSEC = 0.25
 """Largest distance, arcsec, of the centre of the star's pattern, see `center_of_pattern`, from
 where the star should be. The distance was at most 0.06 with sources that leave the pattern visible,
 and 0.33 to 0.6 for real frames moved by 24 pixels, of which the field contains a part."""
 
-_OUTSIDE = 0.35
+_OTHER_SOURCE_FROM_ARCSEC = 0.35
 """Distance, arcsec, from the star beyond which another source is looked for."""
 
-_SOURCE = 0.8
+_POINT_SOURCE_ARCSEC = 0.8
 """Radius, arcsec, in which light is compared with the image of a point source."""
 
-_LIKE_A_SOURCE = 0.79
+_POINT_SOURCE_CORRELATION = 0.79
 """Least correlation of the square roots of light and point source. The correlation was 0.88 to 0.98
 for sources that hide the star in real frames, and at most 0.75 for stars behind the mask."""
 
-_SYMMETRIC = 0.7
+_SYMMETRIC_LIGHT_SHARE = 0.7
 """Share of the light of a point source that is symmetric about it, as far as it is used."""
 
-_AS_BRIGHT = 0.12
+_STAR_LIKE_CONTRAST = 0.12
 """Contrast above which a source that hides the star is taken for the star itself. The contrast was
 at most 0.1 for sources of 0.1 beside real stars, and 0.14 or more for a star 1.5 arcsec off the
 mask; a displacement of 1.2 arcsec and less cannot be told from such a source."""
 
-_AROUND, _VALID = 2.0, 0.75
+_JUDGED_RADIUS_ARCSEC, _VALID_PIXELS_SHARE = 2.0, 0.75
 """Radius, arcsec, and the least share of valid pixels within it. The share is 0.999 in real frames,
 and 0.5 after a Fourier shift of errors with an outlier, which rings through the whole frame."""
 
-_POSITIVE = 0.5
+_POSITIVE_LIGHT_SHARE = 0.5
 """Least share of light that is positive: 1 for a star, 0 where it was subtracted."""
 
-_FACTOR = 1.5
+_BRIGHTNESS_RATIO = 1.5
 """Ratio of brightness between frames of one star that has another cause than the star's position
 behind the mask. The ratio of rolls was at most 1.05 for the real stars at hand."""
 
@@ -72,31 +72,31 @@ _COPY = 0.95
 """Correlation of two frames' noise above which they are one frame. Flat-field errors correlate the
 frames of different stars by up to 0.6."""
 
-_SAME_NOISE = 0.3
+_SAME_NOISE_SIGMAS = 0.3
 """Median difference of two frames, in standard deviations, below which their noise is the same: 1.1
 for two exposures."""
 
-_ENOUGH = 2000
+_FEWEST_PIXELS = 2000
 """Least number of pixels for a correlation or a scatter."""
 
-_FAR = 3.0
+_NOISE_FROM_ARCSEC = 3.0
 """arcsec from the star beyond which pixels show mostly noise."""
 
-_SCATTER = (1e-3, 20.0)
+_PLAUSIBLE_SCATTER_MJY_SR = (1e-3, 20.0)
 """Plausible scatter far from the star, MJy/sr, for exposures of a second to a day."""
 
-_SPECKLES = 1.5
+_COMPARED_SPECKLES_ARCSEC = 1.5
 """Radius, arcsec, in which the diffraction patterns of frames are compared."""
 
-_TURNED = 0.1
+_TURNED_GAIN = 0.1
 """Gain in correlation above which frames are not of one orientation. Real frames of one filter
 correlate by 0.99, mirrored or turned ones by 0.2 to 0.7."""
 
-_ALONE = 0.15
+_SINGLE_SOURCE_ARCSEC = 0.15
 """Distance, arcsec, between the centres of all light and of the star's pattern beyond which another
 source contributes to the light."""
 
-_ALIKE = 0.8
+_ALIKE_CORRELATION = 0.8
 """Least correlation of a pattern with another when it is turned back."""
 
 _SYMMETRIES: dict[str, Callable[[Image], Image]] = {
@@ -121,14 +121,14 @@ def why_few_pixels(observation: Observation) -> str:
             f"the star's position, pixel ({x:.1f}, {y:.1f}) from 0, is not in the frame of {nx} x "
             f"{ny} pixels: CRPIX or STARCEN is wrong, or the star was cut off"
         )
-    share = float(_mean(observation)[2][_distance(observation) < _AROUND].mean())
-    if share >= _VALID:
+    share = float(_mean(observation)[2][_distance(observation) < _JUDGED_RADIUS_ARCSEC].mean())
+    if share >= _VALID_PIXELS_SHARE:
         return ""
     return (
-        f"{share:.0%} of the pixels within {_AROUND:g} arcsec of the star are valid, expected "
-        f"{_VALID:.0%} or more: the others are flagged in DQ, not finite, or have an ERR that is "
-        "not positive. A shift by Fourier transform spreads NaN, and an outlier of ERR, over the "
-        "frame; use the file from before the shift (calints)"
+        f"{share:.0%} of the pixels within {_JUDGED_RADIUS_ARCSEC:g} arcsec of the star are valid, "
+        f"expected {_VALID_PIXELS_SHARE:.0%} or more: the others are flagged in DQ, not finite, or "
+        "have an ERR that is not positive. A shift by Fourier transform spreads NaN, and an "
+        "outlier of ERR, over the frame; use the file from before the shift (calints)"
     )
 
 
@@ -152,17 +152,17 @@ def why_no_star(observation: Observation) -> str:
     if stamp is None:
         return ""
     image, distance, noise = stamp
-    core = distance < _CORE
+    core = distance < _CORE_ARCSEC
     bright = np.abs(image) > 3 * noise
     if np.count_nonzero(bright & core) < 10:
         return (
-            f"no light of a star within {_CORE:g} arcsec of where the header has the star: the "
-            "position (CRPIX or STARCEN) is wrong, the star is not behind the mask, or the "
+            f"no light of a star within {_CORE_ARCSEC:g} arcsec of where the header has the star: "
+            "the position (CRPIX or STARCEN) is wrong, the star is not behind the mask, or the "
             f"exposure is too short. {_INSIST}"
         )
     light = np.where(bright, image, 0.0)
     share = float(light[core].sum() / np.abs(light[core]).sum())
-    if share < _POSITIVE:
+    if share < _POSITIVE_LIGHT_SHARE:
         return (
             f"the light around the star's position is as much negative as positive ({share:.0%} "
             "remain): the star was subtracted, or the background was subtracted with a neighbour "
@@ -176,12 +176,12 @@ def why_no_star(observation: Observation) -> str:
     # behind the mask than a star ten times as bright as the source would leave there.
     scale = observation.pixelscale
     away = center_of_symmetry(light) * scale
-    if np.hypot(*away) <= _BEHIND:
+    if np.hypot(*away) <= _SYMMETRY_OFFSET_ARCSEC:
         return ""
-    if np.hypot(*(center_of_pattern(light, distance) * scale)) <= _PATTERN_BEHIND:
+    if np.hypot(*(center_of_pattern(light, distance) * scale)) <= _PATTERN_OFFSET_ARCSEC:
         return ""
     contrast = _contrast_of_source(observation)
-    if contrast < _AS_BRIGHT:
+    if contrast < _STAR_LIKE_CONTRAST:
         return ""
     x, y = away
     what = (
@@ -191,9 +191,9 @@ def why_no_star(observation: Observation) -> str:
     )
     return (
         f"its light is centred {np.hypot(x, y):.1f} arcsec from the star's position ({x:+.1f} "
-        f"in x, {y:+.1f} in y), expected less than {_BEHIND:g}, and {what}: the position (CRPIX or "
-        "STARCEN) is wrong, the star is not behind the mask, or something brighter than the star "
-        f"behind the mask (a star, a galaxy) is in the field. {_INSIST}"
+        f"in x, {y:+.1f} in y), expected less than {_SYMMETRY_OFFSET_ARCSEC:g}, and {what}: the "
+        "position (CRPIX or STARCEN) is wrong, the star is not behind the mask, or something "
+        f"brighter than the star behind the mask (a star, a galaxy) is in the field. {_INSIST}"
     )
 
 
@@ -206,7 +206,7 @@ _INSIST = (
 def _contrast_of_source(observation: Observation) -> float:
     """Least contrast of the brightest point source beside the star; infinite if it is not one."""
     try:
-        star, source = images_of_stars(observation, _CORE, _SOURCE)
+        star, source = images_of_stars(observation, _CORE_ARCSEC, _POINT_SOURCE_ARCSEC)
     except DiffrenderError:
         return np.inf
     scale = float(np.mean(observation.pixelscale))
@@ -214,9 +214,9 @@ def _contrast_of_source(observation: Observation) -> float:
     image = np.where(valid, data - float(np.quantile(data[valid], 0.25)), 0.0)
     rows, columns = np.indices(image.shape)
     x, y = observation.mean_center
-    outside = np.hypot(columns - x, rows - y) * scale > _OUTSIDE
+    outside = np.hypot(columns - x, rows - y) * scale > _OTHER_SOURCE_FROM_ARCSEC
     peak = _peak(np.where(outside, gaussian_filter(image, 1.0), -np.inf))
-    if _likeness(image, peak, source, _peak(source), scale) < _LIKE_A_SOURCE:
+    if _likeness(image, peak, source, _peak(source), scale) < _POINT_SOURCE_CORRELATION:
         return np.inf
     # A point source is symmetric about its peak, other light need not be: the smaller one of two
     # opposite pixels has what the source may account for.
@@ -225,8 +225,8 @@ def _contrast_of_source(observation: Observation) -> float:
     )
     symmetric = np.clip(np.minimum(image, mirrored), 0.0, None)
     # What may be light of the star: the model of the source's wings is not perfect.
-    left = uniform_filter(image - _SYMMETRIC * symmetric, 3)
-    behind = np.hypot(columns - x, rows - y) * scale < _BEHIND / 2
+    left = uniform_filter(image - _SYMMETRIC_LIGHT_SHARE * symmetric, 3)
+    behind = np.hypot(columns - x, rows - y) * scale < _SYMMETRY_OFFSET_ARCSEC / 2
     # Fluxes in units of the model's star: at most `most` for the star behind the mask, `flux` for
     # the source outside it.
     most = max(float(left[behind].max()), 0.0) / float(uniform_filter(star, 3).max())
@@ -251,7 +251,7 @@ def _peak(image: Image) -> Image:
 
 def _likeness(image: Image, place: Image, other: Image, there: Image, scale: float) -> float:
     """Correlation of the square roots of two images about two points, within 0.8 arcsec."""
-    reach = int(_SOURCE / scale)
+    reach = int(_POINT_SOURCE_ARCSEC / scale)
     rows, columns = np.indices((2 * reach + 1, 2 * reach + 1)) - reach
     disk = np.hypot(rows, columns) <= reach
     roots = [
@@ -275,7 +275,11 @@ def brightness(observation: Observation) -> float:
     x, y = center - np.round(center)
     rows, columns = np.indices(image.shape) - len(image) // 2
     distance = np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale))
-    return float((image * np.clip((_CORE + _SOFT - distance) / (2 * _SOFT), 0.0, 1.0)).sum())
+    return float(
+        (
+            image * np.clip((_CORE_ARCSEC + _EDGE_ARCSEC - distance) / (2 * _EDGE_ARCSEC), 0.0, 1.0)
+        ).sum()
+    )
 
 
 def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
@@ -294,7 +298,7 @@ def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
         # Of two, each is compared with the other.
         other = middle if len(known) > 2 else float(light[known].sum() - light[k])
         ratio = float(light[k]) / other
-        if not 1 / _FACTOR < ratio < _FACTOR:
+        if not 1 / _BRIGHTNESS_RATIO < ratio < _BRIGHTNESS_RATIO:
             reasons[int(k)] = (
                 f"its star is {ratio:.3g} times as bright as in the other frames of the star. A "
                 "unit (BUNIT) or a factor is probably wrong, or the star is not behind the mask"
@@ -335,14 +339,14 @@ def _pattern(observation: Observation) -> Image | None:
     scale = float(np.mean(observation.pixelscale))
     light = np.where(np.abs(image) > 3 * noise, image, 0.0)
     x, y = center_of_symmetry(light)
-    if np.hypot(x, y) * scale > _BEHIND:
+    if np.hypot(x, y) * scale > _SYMMETRY_OFFSET_ARCSEC:
         return None
     rows, columns = np.indices(image.shape) - len(image) // 2
     about = center_of_pattern(light, np.hypot(columns - x, rows - y) * scale)
-    if np.hypot(*(about - (x, y))) * scale > _ALONE:
+    if np.hypot(*(about - (x, y))) * scale > _SINGLE_SOURCE_ARCSEC:
         return None
     image = shift(image, (-y, -x), order=1)
-    reach, middle = int(_SPECKLES / scale), len(image) // 2
+    reach, middle = int(_COMPARED_SPECKLES_ARCSEC / scale), len(image) // 2
     window = slice(max(middle - reach, 0), middle + reach + 1)
     image = image[window, window]
     return np.sign(image) * np.sqrt(np.abs(image))
@@ -358,7 +362,9 @@ def _turn(pattern: Image, other: Image) -> str:
 
     likenesses = {name: likeness(undo(pattern)) for name, undo in _SYMMETRIES.items()}
     best = max(likenesses, key=lambda name: likenesses[name])
-    return best if likenesses[best] > max(_ALIKE, likeness(pattern) + _TURNED) else ""
+    return (
+        best if likenesses[best] > max(_ALIKE_CORRELATION, likeness(pattern) + _TURNED_GAIN) else ""
+    )
 
 
 def why_odd_unit(observation: Observation) -> str:
@@ -367,12 +373,12 @@ def why_odd_unit(observation: Observation) -> str:
     Only frames in MJy/sr with 2000 pixels far from the star are judged.
     """
     difference, usable = _noise(observation, clipped=False)
-    if usable.sum() < _ENOUGH or observation.unit != u.MJy / u.sr:
+    if usable.sum() < _FEWEST_PIXELS or observation.unit != u.MJy / u.sr:
         return ""
     dark = dark_pixels(_mean(observation)[0], usable)
     # A pixel less the mean of four has the variance 1 + 1/4.
     scatter = float(median_abs_deviation(difference[dark], scale="normal")) / 1.25**0.5
-    low, high = _SCATTER
+    low, high = _PLAUSIBLE_SCATTER_MJY_SR
     if low < scatter < high:
         return ""
     return (
@@ -398,7 +404,7 @@ def copies(observations: Sequence[Observation]) -> dict[int, int]:
             if j in result or others.shape != values.shape:
                 continue
             both = usable & too
-            if both.sum() < _ENOUGH:
+            if both.sum() < _FEWEST_PIXELS:
                 continue
             if np.corrcoef(values[both], others[both])[0, 1] > _COPY and not _differ_by_noise(
                 observations[k], observations[j], both
@@ -418,7 +424,7 @@ def _differ_by_noise(
     # The factor a, of another unit, that makes sum of (mine - a theirs)^2 minimal.
     factor = float((mine * theirs).sum() / (theirs**2).sum())
     # Of two exposures the noise of the difference is 1.6 times the error of one.
-    return float(np.median(np.abs(mine - factor * theirs) / error[usable])) > _SAME_NOISE
+    return float(np.median(np.abs(mine - factor * theirs) / error[usable])) > _SAME_NOISE_SIGMAS
 
 
 def _mean(observation: Observation) -> tuple[Image, Image, NDArray[np.bool_]]:
@@ -445,7 +451,7 @@ def _noise(observation: Observation, *, clipped: bool = True) -> tuple[Image, ND
     """Differences from neighbouring pixels, clipped, and which of them are far from the star."""
     data, _, valid = _mean(observation)
     difference = data - convolve(data, _NEIGHBOURS, mode="nearest")
-    usable = valid & (_distance(observation) > _FAR)
+    usable = valid & (_distance(observation) > _NOISE_FROM_ARCSEC)
     typical = float(np.median(np.abs(difference[usable]))) if usable.any() else 0.0
     if typical > 0 and clipped:
         difference = np.clip(difference / typical, -6, 6)

@@ -33,7 +33,7 @@ _REDUCED = {
     "seconds": "DRSECS",
     "opd": "DROPD",
     "opd_sha256": "DRSHA256",
-    "systematics": "DRSYST",
+    "pattern": "DRPATTRN",
 }
 """Keywords of a reduction's provenance."""
 

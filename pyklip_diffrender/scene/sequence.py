@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections import abc
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -99,27 +98,27 @@ class Row:
         }
 
 
-_UNITS = {
+_COLUMN_UNITS = {
     "position_angle": u.deg, "ra": u.deg, "dec": u.deg, "offset_x": u.arcsec, "offset_y": u.arcsec,
 }  # fmt: skip
 
 
-def rows_table(rows: abc.Sequence[Row]) -> QTable:
-    """Make the table; see `pyklip_diffrender.Sequence.table`."""
+def rows_table(rows: Sequence[Row]) -> QTable:
+    """Make the table; see `pyklip_diffrender.ExposureSequence.table`."""
     values = [row.values() for row in rows]
     table = QTable({name: [each[name] for each in values] for name in values[0]})
-    for name, unit in _UNITS.items():
+    for name, unit in _COLUMN_UNITS.items():
         table[name] = np.asarray(table[name], dtype=float) * unit
     table["position_angle"].info.format = ".2f"
     return table
 
 
-_NEARLY_THE_SAME = 2
+_SAME_WINDOW_PIXELS = 2
 """Pixels by which the stars of two frames may be apart for one window on the detector."""
 
 
 @dataclass(frozen=True)
-class Sequence:
+class ExposureSequence:
     """Observations of one target through one filter, with its reference stars.
 
     Attributes
@@ -142,12 +141,12 @@ class Sequence:
     >>> import pyklip_diffrender as dr
     >>> ones = np.ones((8, 8))
     >>> frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
-    >>> dr.Sequence("HD 1", (frame,))
-    <Sequence: HD 1 in F444W, 1 of the target, 0 of reference stars>
+    >>> dr.ExposureSequence("HD 1", (frame,))
+    <ExposureSequence: HD 1 in F444W, 1 of the target, 0 of reference stars>
 
     From a folder of files, which the package does not contain:
 
-    >>> dr.Sequence.from_files("calints", target="HD 1")  # doctest: +SKIP
+    >>> dr.ExposureSequence.from_files("calints", target="HD 1")  # doctest: +SKIP
     """
 
     target: str
@@ -162,7 +161,7 @@ class Sequence:
 
     def __repr__(self) -> str:
         return (
-            f"<Sequence: {self.target} in {self.filter}, {len(self.science)} of the "
+            f"<ExposureSequence: {self.target} in {self.filter}, {len(self.science)} of the "
             f"target, {len(self.references)} of reference stars>"
         )
 
@@ -185,7 +184,7 @@ class Sequence:
         epoch: str | Time | None = None,
         references: Iterable[str | os.PathLike[str]] = (),
         star: tuple[float, float] | None = None,
-    ) -> Sequence:
+    ) -> ExposureSequence:
         """Sort JWST coronagraphic files into target and reference stars.
 
         Every file is judged by its header and its pixels. What is not a frame of a star behind a
@@ -218,7 +217,7 @@ class Sequence:
 
         Returns
         -------
-        Sequence
+        ExposureSequence
             The sequence; its `table` lists all files, what they are used for and why.
 
         Raises
@@ -244,13 +243,15 @@ class Sequence:
         *,
         target: str | None = None,
         filter: str | None = None,
-    ) -> Sequence:
+    ) -> ExposureSequence:
         """Sort files that were opened, see `from_files`."""
         admission = admitted(with_references(files, references))
         return cls._only(cls._by_epoch(admission, target, filter), None)
 
     @staticmethod
-    def _only(sequences: tuple[Sequence, ...], epoch: str | Time | None) -> Sequence:
+    def _only(
+        sequences: tuple[ExposureSequence, ...], epoch: str | Time | None
+    ) -> ExposureSequence:
         """The sequence of an epoch, or the only one."""
         if epoch is not None:
             date = Time(epoch)
@@ -268,7 +269,8 @@ class Sequence:
             raise IncompatibleSetupError(
                 f"{sequences[0].target}: the frames are of {len(sequences)} epochs, whose "
                 f"wavefronts differ: {_days(sequences)}. Reduce each of them alone: choose one "
-                "with epoch=..., or take all with Sequence.by_epoch. The command reduce does so"
+                "with epoch=..., or take all with ExposureSequence.by_epoch. The command reduce "
+                "does so"
             )
         return sequences[0]
 
@@ -281,16 +283,16 @@ class Sequence:
         filter: str | None = None,
         references: Iterable[str | os.PathLike[str]] = (),
         star: tuple[float, float] | None = None,
-    ) -> tuple[Sequence, ...]:
+    ) -> tuple[ExposureSequence, ...]:
         """Sort files as `from_files` does, into one sequence for each epoch.
 
         Frames of the target more than 5 days apart belong to different epochs. Reference stars go
-        with all epochs: for the wavefront with epochs within 5 days, else for the flat-field
+        with all epochs: for the wavefront with epochs within 5 days, else for the detector
         pattern and KLIP.
 
         Returns
         -------
-        tuple of Sequence
+        tuple of ExposureSequence
             In order of time.
         """
         return cls._by_epoch(_usable(files, references, star, target, filter), target, filter)
@@ -304,14 +306,14 @@ class Sequence:
         filter: str | None = None,
         references: Iterable[str | os.PathLike[str]] = (),
         star: tuple[float, float] | None = None,
-    ) -> tuple[Sequence, ...]:
+    ) -> tuple[ExposureSequence, ...]:
         """Sort files into one sequence for each filter and epoch of the target.
 
         For the arguments see `by_epoch`; with `filter` there is one filter.
 
         Returns
         -------
-        tuple of Sequence
+        tuple of ExposureSequence
             In order of time.
         """
         # Stars are told apart for every filter alone. Where there are several filters, frames are
@@ -336,7 +338,7 @@ class Sequence:
     @classmethod
     def _by_epoch(
         cls, admission: Admission, target: str | None, filter: str | None
-    ) -> tuple[Sequence, ...]:
+    ) -> tuple[ExposureSequence, ...]:
         """Sort files, some of which are left out already."""
         choose_filter(admission, filter)
         star, stars = choose_target(admission, target)
@@ -370,7 +372,7 @@ class Sequence:
         chosen: list[FrameFile],
         admission: Admission,
         stars: Mapping[FrameFile, str],
-    ) -> Sequence:
+    ) -> ExposureSequence:
         """Make the sequence of one epoch; `chosen` are the target's frames."""
         dates = [each.exposure.date for each in chosen if each.exposure.date is not None]
         rows, excluded = [], []
@@ -394,7 +396,7 @@ class Sequence:
                 exposures[part.name] = re.sub(r"-seg\d+", "", each.exposure.identity or part.name)
                 remarks = list(part.remarks)
                 if not _is_near(each.exposure.date, dates):
-                    remarks.append(f"{OF_ANOTHER_EPOCH}: for the flat-field pattern and KLIP only")
+                    remarks.append(f"{OF_ANOTHER_EPOCH}: for the detector pattern and KLIP only")
                 remark = "; ".join(remarks)
                 rows.append(
                     Row(use, name, each.exposure, part, remark, each.path, each.for_reference)
@@ -460,12 +462,14 @@ class Sequence:
                 continue
             # Distance on the detector from this window's first pixel to the first window's.
             x, y = first - place
-            if max(abs(x), abs(y)) <= _NEARLY_THE_SAME:
+            if max(abs(x), abs(y)) <= _SAME_WINDOW_PIXELS:
                 windows[k] = Window(windows[k].y + int(y), windows[k].x + int(x), shape)
         count = len(self.science)
         return tuple(windows[:count]), tuple(windows[count:])
 
-    def cutout(self, size: int | tuple[int, int], *, beyond_edges: bool = False) -> Sequence:
+    def cutout(
+        self, size: int | tuple[int, int], *, beyond_edges: bool = False
+    ) -> ExposureSequence:
         """Cut the pixels about the star out of every frame, see `windows`.
 
         Parameters
@@ -513,10 +517,10 @@ def epochs_of_files(
     target: str | None = None,
     filter: str | None = None,
 ) -> tuple[Epoch, ...]:
-    """List the epochs that `Sequence.by_epoch` sorts files into, in order of time.
+    """List the epochs that `ExposureSequence.by_epoch` sorts files into, in order of time.
 
     Pixels are judged only where the headers leave open which file, filter or target is meant, or
-    have several epochs. Raises as `Sequence.from_files`.
+    have several epochs. Raises as `ExposureSequence.from_files`.
     """
     admission = _usable(files, ())
     filter = choose_filter(admission, filter)
@@ -621,7 +625,7 @@ def by_reason(excluded: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     ]
 
 
-def _days(sequences: Iterable[Sequence]) -> str:
+def _days(sequences: Iterable[ExposureSequence]) -> str:
     """The epochs of sequences with their files, for messages."""
     return "; ".join(
         f"{'no date' if each.date is None else each.date.isot[:10]} "

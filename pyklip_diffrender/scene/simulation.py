@@ -33,11 +33,11 @@ from pyklip_diffrender.wavefront.opd import random_opd
 
 Items = tuple[tuple[str, Any], ...]
 
-_NPIX = 256
+_PUPIL_SAMPLES = 256
 """Samples across the pupil. The error of so coarse a grid, 2 % of the image, is static, and the
 fit absorbs it: with 256 and 512 samples the residual of real frames was the same."""
 
-_CELLS = 1.2
+_CELLS_PER_LAMBDA_D = 1.2
 """Cells of the occulter per lambda/D. The round masks have no structure finer than several
 lambda/D, so that this changes images by 3e-7 of their peak or less, and one cell per pixel is
 enough in all filters of both channels; two cells per pixel take four times as long."""
@@ -117,8 +117,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             "pixelscale": place.siaf_pixelscale,
             "shear": place.siaf_shear,
             "nlambda": 7,
-            "npix": pupil_samples(observation, shape, _NPIX, place),
-            "occulter_sampling": _CELLS,
+            "npix": pupil_samples(observation, shape, _PUPIL_SAMPLES, place),
+            "occulter_sampling": _CELLS_PER_LAMBDA_D,
             "defaults": FLIGHT_ALIGNMENT
             if stop_is_measured(place.mask, place.short_wave, place.module)
             else None,
@@ -292,7 +292,7 @@ def simulate(
     --------
     >>> import pyklip_diffrender as dr
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
-    >>> dr.simulate(model, dr.Scene(), dr.random_opd(1, npix=128), seed=1)
+    >>> dr.simulate(model, dr.Scene(), dr.wavefront.random_opd(1, npix=128), seed=1)
     <Observation 'simulation(seed=1)': 1 frame of 24 x 24 pixels, F444W, ph, no date>
     """
     require_imaged(model, scene.planets, "scene")

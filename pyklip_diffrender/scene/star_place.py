@@ -8,37 +8,37 @@ from scipy.ndimage import gaussian_filter
 
 Image = NDArray[np.float64]
 
-_FIELD = 2.5
+_FIELD_RADIUS_ARCSEC = 2.5
 """Radius, arcsec, of the square in which the star is looked for."""
 
-_LEAST_FIELD = 1.2
+_LEAST_FIELD_ARCSEC = 1.2
 """Radius below which a frame is too small to judge."""
 
-_SKY = 3.0
+_SKY_ARCSEC = 3.0
 """arcsec from the star beyond which the background is measured."""
 
-_ENOUGH = 2000
+_SKY_PIXELS = 2000
 """Least number of pixels for the background; with fewer, it is the faintest fifth of all."""
 
-_RING, _ENOUGH_OF_RING = 1.8, 300
+_RING_ARCSEC, _FEWEST_RING_PIXELS = 1.8, 300
 """Distance, arcsec, and number of pixels of a ring about the star, whose darkest quarter is no
 darker than the background."""
 
-_INNER, _OUTER, _CONCENTRATED = 1.0, 2.0, 5.0
+_INNER_LIGHT_ARCSEC, _OUTER_LIGHT_ARCSEC, _CONCENTRATED_LIGHT_RATIO = 1.0, 2.0, 5.0
 """Ratio of the light within 1 arcsec and beyond 2 arcsec above which an image shows a star."""
 
-_SEEN = 3.0
+_SEEN_PIXEL_SNR = 3.0
 """S/N of the pixels that are looked at."""
 
-_PATTERN = 1.2
+_PATTERN_ARCSEC = 1.2
 """Radius, arcsec, of the star's light in which other sources count little, see
 `center_of_pattern`."""
 
-_AGREE = 0.05
+_LIGHT_CENTRES_ARCSEC = 0.05
 """Difference, arcsec, between the centres of all light and of the light near the star beyond which
 another source contributes to them."""
 
-_NEAR = 0.5
+_STAR_OFFSET_ARCSEC = 0.5
 """Largest distance, arcsec, of a star from its stated place at which its light can be told from
 another source's."""
 
@@ -54,19 +54,23 @@ def stamp_about(
     """
     x, y = np.round(center).astype(int)
     ny, nx = data.shape
-    reach = min(int(_FIELD / pixelscale), x, y, nx - 1 - x, ny - 1 - y)
-    if reach * pixelscale < _LEAST_FIELD or not valid.any():
+    reach = min(int(_FIELD_RADIUS_ARCSEC / pixelscale), x, y, nx - 1 - x, ny - 1 - y)
+    if reach * pixelscale < _LEAST_FIELD_ARCSEC or not valid.any():
         return None
     window = np.s_[y - reach : y + reach + 1, x - reach : x + reach + 1]
     rows, columns = np.indices((2 * reach + 1, 2 * reach + 1)) - reach
     distance = np.hypot(rows, columns) * pixelscale
     all_rows, all_columns = np.indices(data.shape)
-    outside = valid & (np.hypot(all_columns - x, all_rows - y) * pixelscale > _SKY)
-    sky = data[outside] if outside.sum() > _ENOUGH else np.sort(data[valid])[: valid.sum() // 5 + 1]
+    outside = valid & (np.hypot(all_columns - x, all_rows - y) * pixelscale > _SKY_ARCSEC)
+    sky = (
+        data[outside]
+        if outside.sum() > _SKY_PIXELS
+        else np.sort(data[valid])[: valid.sum() // 5 + 1]
+    )
     # A nebula or a neighbour may be brighter elsewhere than about the star.
-    ring = data[window][valid[window] & (distance > _RING)]
+    ring = data[window][valid[window] & (distance > _RING_ARCSEC)]
     level = float(np.median(sky))
-    if ring.size > _ENOUGH_OF_RING:
+    if ring.size > _FEWEST_RING_PIXELS:
         level = min(level, float(np.quantile(ring, 0.25)))
     image = np.where(valid[window], data[window] - level, np.nan)
     # A pixel that is missing in the core would move the centre of symmetry.
@@ -114,7 +118,9 @@ def center_of_pattern(image: Image, distance: Image) -> Image:
     """
     # Square roots, within 1.2 arcsec of the middle: a point source is then a small part of the
     # light, and the star's pattern, which fills the field, most of it.
-    return center_of_symmetry(np.sqrt(np.maximum(np.where(distance < _PATTERN, image, 0.0), 0.0)))
+    return center_of_symmetry(
+        np.sqrt(np.maximum(np.where(distance < _PATTERN_ARCSEC, image, 0.0), 0.0))
+    )
 
 
 def measured_offset(
@@ -129,20 +135,20 @@ def measured_offset(
     if stamp is None:
         return None
     image, distance, noise = stamp
-    inside, outside = image[distance < _INNER], image[distance > _OUTER]
+    inside, outside = image[distance < _INNER_LIGHT_ARCSEC], image[distance > _OUTER_LIGHT_ARCSEC]
     if not (inside.size and outside.size):
         return None
-    if inside.mean() < _CONCENTRATED * np.abs(outside.mean()):
+    if inside.mean() < _CONCENTRATED_LIGHT_RATIO * np.abs(outside.mean()):
         return None
-    bright = np.where(image > _SEEN * noise, image, 0.0)
+    bright = np.where(image > _SEEN_PIXEL_SNR * noise, image, 0.0)
     if np.count_nonzero(bright) < 10:
         return None
     away = center_of_symmetry(bright)
-    if np.hypot(*away) * pixelscale > _NEAR:
+    if np.hypot(*away) * pixelscale > _STAR_OFFSET_ARCSEC:
         return None
     rows, columns = np.indices(image.shape) - len(image) // 2
     about = np.hypot(columns - away[0], rows - away[1]) * pixelscale
-    if np.hypot(*(center_of_pattern(bright, about) - away)) * pixelscale > _AGREE:
+    if np.hypot(*(center_of_pattern(bright, about) - away)) * pixelscale > _LIGHT_CENTRES_ARCSEC:
         return None
     # `stamp_about` has the nearest whole pixel in its middle.
     return np.asarray(np.round(center) + away - center)

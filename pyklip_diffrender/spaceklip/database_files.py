@@ -65,7 +65,7 @@ def source_table(detection: Detection, product: Path) -> Table:
 
 # Files of a reduction where spaceKLIP looks for them, and in its form.
 
-_COLUMNS = (
+_HEADER_COLUMNS = (
     "TELESCOP", "TARGPROP", "TARG_RA", "TARG_DEC", "INSTRUME", "DETECTOR", "FILTER", "CWAVEL",
     "DWAVEL", "PUPIL", "CORONMSK", "EXP_TYPE", "EFFINTTM", "SUBARRAY", "APERNAME", "PPS_APER",
     "PIXSCALE", "PIXAR_SR", "BUNIT", "BLURFWHM",
@@ -98,7 +98,7 @@ def complete_header(product: Path, table: Table, mode: str) -> None:
     place = [known_number(frame, key) for key in ("CRVAL1", "CRVAL2", "PIXAR_A2")]
     with fits.open(product, mode="update", memmap=False) as hdus:
         header = hdus[0].header
-        for name in _COLUMNS:
+        for name in _HEADER_COLUMNS:
             value = _values(science, name)[0]
             # FITS has no NaN in headers; spaceKLIP takes a missing keyword for one.
             if value is not None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,7 +28,7 @@ from pyklip_diffrender.pyklip_backend.source_frames import JudgedFiles, OpenedFi
 from pyklip_diffrender.reduction import SPECTRA, by_star, in_words, search_together
 from pyklip_diffrender.refinement import to_jansky
 from pyklip_diffrender.scene.frame_file import FrameFile
-from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 from pyklip_diffrender.spaceklip.database_files import (
     complete_header,
     source_table,
@@ -66,16 +65,17 @@ def run_obs(
     subdir: str = "diffrender",
     save_rolls: bool = False,
     star_flux: Mapping[str, float | str | u.Quantity] | None = None,
-    spectra: abc.Sequence[str] = SPECTRA,
+    spectra: Sequence[str] = SPECTRA,
     verbose: bool = False,
     **settings: Any,
 ) -> dict[str, Detection]:
     """Subtract the star from every concatenation of a spaceKLIP database, and search for planets.
 
     All rolls of a concatenation are fitted together. References (TYPE is REF) are used only where
-    the library has no flat-field pattern for the pixels, or with ``systematics="references"``; none
+    the library has no detector pattern for the pixels, or with ``pattern="references"``; none
     are needed. The products are added to ``database.red`` and the candidates to ``database.src``.
-    Every file is judged before the first fit as `pyklip_diffrender.Sequence.from_files` judges it.
+    Every file is judged before the first fit as `pyklip_diffrender.ExposureSequence.from_files`
+    judges it.
 
     Files of each concatenation have the prefix ``<mode>_NANNU1_NSUBS1_<concatenation>``:
 
@@ -117,7 +117,7 @@ def run_obs(
     verbose : bool
         Print what is being done.
     **settings
-        Other fields of `DiffrenderSettings`, such as `systematics`, `threshold` and
+        Other fields of `DiffrenderSettings`, such as `pattern`, `threshold` and
         `star_flux_error`.
 
     Returns
@@ -145,7 +145,7 @@ def run_obs(
 
     Examples
     --------
-    With a `database` that spaceKLIP has made, and a folder of wavefront maps:
+    With a `database` that spaceKLIP has made, and a folder of OPD maps:
 
     >>> from pyklip_diffrender import spaceklip
     >>> spaceklip.run_obs(database, opd="maps")  # doctest: +SKIP
@@ -200,7 +200,7 @@ def run_obs(
 
 
 def _search_together(
-    detections: Mapping[str, Detection], folder: Path, spectra: abc.Sequence[str]
+    detections: Mapping[str, Detection], folder: Path, spectra: Sequence[str]
 ) -> None:
     """Search the concatenations of every target that has several, and write what is found.
 
@@ -265,7 +265,7 @@ def why_unsupported(table: Table) -> str | None:
 def _admitted(key: str, table: Table) -> tuple[Table, JudgedFiles]:
     """Rows of a concatenation whose files are used, and the files, which are opened once.
 
-    Raises as `Sequence.from_files`, and warns of every file that is left out.
+    Raises as `ExposureSequence.from_files`, and warns of every file that is left out.
     """
     paths = [Path(str(path)).absolute() for path in table["FITSFILE"]]
     opened: dict[Path, OpenedFile] = {}
@@ -277,7 +277,7 @@ def _admitted(key: str, table: Table) -> tuple[Table, JudgedFiles]:
         except (CorruptFileError, KeyError):
             file = FrameFile.opened(path)  # It says what is wrong.
         listed[str(kind) == "SCI"].append(file)
-    sequence = Sequence.of_opened(listed[True], listed[False])
+    sequence = ExposureSequence.of_opened(listed[True], listed[False])
     for name, reason in sequence.excluded:
         warnings.warn(f"{key}: {name} is left out: {reason}", DiffrenderWarning, stacklevel=3)
     used = {row.path for row in sequence.rows if row.use != "excluded"}

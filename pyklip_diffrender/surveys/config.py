@@ -17,7 +17,7 @@ from pyklip_diffrender.options import OPTIONS, Option, SharedOptions
 from pyklip_diffrender.scene.associations import matches
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
-_PIXEL = 0.063
+_PIXEL_ARCSEC = 0.063
 """arcsec; for the largest separation of an injected planet."""
 
 _WORKERS = Option(
@@ -28,7 +28,7 @@ _SPECTRA = ("blackbody", "flat", "free")
 """Names of spectra that `combine` knows."""
 
 _NOT_IN_TOML = ("basis", "prior", "drift", "dither_drift", "companions", "memory")
-"""Fields of GaussNewton that are objects of Python, and the memory, for which surveys have
+"""Fields of FitSettings that are objects of Python, and the memory, for which surveys have
 `memory_limit`."""
 
 
@@ -39,7 +39,7 @@ class Options(SharedOptions):
     Attributes
     ----------
     settings : dict
-        Arguments of `GaussNewton.nircam`; empty for the defaults of `reduce`.
+        Arguments of `FitSettings.nircam`; empty for the defaults of `reduce`.
     """
 
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -76,10 +76,10 @@ class SequenceConfig:
     files : tuple of Path
         Files, association files and folders.
     opd : Path
-        A wavefront map, or a folder of maps, of which the nearest in time is used; ``Path("flat")``
+        An OPD map, or a folder of maps, of which the nearest in time is used; ``Path("flat")``
         for a flat wavefront.
     target, filter : str or None
-        As for `Sequence.from_files`.
+        As for `ExposureSequence.from_files`.
     options : Options
     injections : Injections
     """
@@ -239,7 +239,7 @@ class _Reader:
                 self.matching,
             ),
             "opd": (
-                "a wavefront map or a folder of maps that exists, or 'flat'",
+                "an OPD map or a folder of maps that exists, or 'flat'",
                 lambda value: Path(FLAT) if value == FLAT else self.existing(value),
             ),
             "target": ("text, the name of the star", _text),
@@ -250,7 +250,7 @@ class _Reader:
         })  # fmt: skip
         own = self.options(given, options, place)
         planets = self.injections(given.pop("injections", {}), planets, f"{place}: injections")
-        edge = own.side * _PIXEL / 2
+        edge = own.side * _PIXEL_ARCSEC / 2
         for each in planets.separations:
             if each >= edge:
                 expected = f"less than {edge:.2g} arcsec, half of the field"
@@ -270,10 +270,10 @@ class _Reader:
     def option_keys(self) -> Keys:
         """Keys of the options of a reduction, by what these declare."""
         checks = {each.name: OPTIONS[each.name].checked for each in fields(SharedOptions)}
-        checks["systematics"] = self.pattern
+        checks["pattern"] = self.pattern
         return {
             **{name: (OPTIONS[name].expected, check) for name, check in checks.items()},
-            "settings": ("a table with arguments of GaussNewton", _table),
+            "settings": ("a table with arguments of FitSettings", _table),
         }
 
     def options(self, given: dict[str, Any], default: Options, place: str) -> Options:
@@ -311,8 +311,8 @@ class _Reader:
         return planets
 
     def pattern(self, value: Any) -> str:
-        """A flat-field pattern: one of the words for it, or a path."""
-        if value in OPTIONS["systematics"].choices:
+        """A detector pattern: one of the words for it, or a path."""
+        if value in OPTIONS["pattern"].choices:
             return str(value)
         # Late, see `_wrong_settings`. Files without patterns are found before any job begins.
         from pyklip_diffrender.pattern import as_request
@@ -389,22 +389,22 @@ _TABLE: tuple[str, Check] = ("a table with keys", lambda value: value)
 
 
 def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
-    """Mistakes in arguments of `GaussNewton.nircam`."""
+    """Mistakes in arguments of `FitSettings.nircam`."""
     # Late, as everything that waits for PyTorch: workers import this module to unpickle a job.
-    from pyklip_diffrender.refinement import GaussNewton
+    from pyklip_diffrender.refinement import FitSettings
 
-    known = [each.name for each in fields(GaussNewton) if each.name not in _NOT_IN_TOML]
+    known = [each.name for each in fields(FitSettings) if each.name not in _NOT_IN_TOML]
     unknown = sorted(set(settings) - set(known))
     if unknown:
         return [f"got the key {_short(key)}, expected one of {', '.join(known)}" for key in unknown]
     if not _is_plain(settings):
         return ["got a date or nan, expected numbers, text, lists and tables"]
     try:
-        GaussNewton.nircam(**settings)
+        FitSettings.nircam(**settings)
     except DiffrenderError as error:
         return [str(error)]
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        return [f"got a value of the wrong type ({error}), expected the types of GaussNewton"]
+        return [f"got a value of the wrong type ({error}), expected the types of FitSettings"]
     return []
 
 

@@ -32,10 +32,10 @@ from pyklip_diffrender.surveys.survey_page import row, table_of, write_tables
 
 _log = logging.getLogger(__name__)
 
-_OF_WORKER = 0.8
+_WORKER_MEMORY_SHARE = 0.8
 """Memory that jobs are to take, as a fraction of the worker's, which is killed at 0.95."""
 
-_SHARE = 20.0
+_TABLES_WAIT_RATIO = 20.0
 """The tables are written again after this many times the seconds that writing them took."""
 
 
@@ -98,7 +98,7 @@ def survey(
     limit = read_config(config).memory_limit
     work: Work = reduce_job
     if limit is not None:
-        work = partial(reduce_job, memory=_OF_WORKER * limit)
+        work = partial(reduce_job, memory=_WORKER_MEMORY_SHARE * limit)
     return run_survey(config, output, work, scheduler, progress=progress)
 
 
@@ -223,7 +223,7 @@ class _Board:
             # There may be room again for the next job.
             _log.warning("%s", error)
         ended = time.monotonic()
-        self.next = ended + _SHARE * (ended - began)
+        self.next = ended + _TABLES_WAIT_RATIO * (ended - began)
 
     def write(self) -> None:
         """Write tables and page; raises IncompatibleSetupError if they cannot be written."""

@@ -10,8 +10,7 @@ import socket
 import sys
 import time
 import traceback
-from collections import abc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -33,7 +32,7 @@ from pyklip_diffrender.reduction import (
 from pyklip_diffrender.refinement import FrameFit, Refinement, nircam_settings
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 from pyklip_diffrender.surveys.jobs import (
     Injection,
     Job,
@@ -58,15 +57,13 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         fit = Refinement.read(folder.parent / job.base_folder / "fit.fits")
         first = fit.frames[0].observation
         planet = _planet(job.injection, first.position_angle)
-        frames: abc.Sequence[FrameFit] = [
-            each for each in fit.frames if not each.observation.reference
-        ]
+        frames: Sequence[FrameFit] = [each for each in fit.frames if not each.observation.reference]
         references = tuple(each.observation for each in fit.frames if each.observation.reference)
         if job.options.disk:
             frames = _with_disk(frames, _sequence(job).cutout(job.options.side).science)
         science = with_planets(frames, [planet])
-        sequence = Sequence(first.target, science, references)
-        changes |= {"systematics": fit.systematics or "off", "wide": False}
+        sequence = ExposureSequence(first.target, science, references)
+        changes |= {"pattern": fit.pattern or "off", "wide": False}
     else:
         sequence = _sequence(job)
     options = _options(job, sequence.science[0], **changes)
@@ -78,8 +75,10 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
     return result
 
 
-def _sequence(job: Job) -> Sequence:
-    return Sequence.from_files(job.files, target=job.target, filter=job.filter, epoch=job.epoch)
+def _sequence(job: Job) -> ExposureSequence:
+    return ExposureSequence.from_files(
+        job.files, target=job.target, filter=job.filter, epoch=job.epoch
+    )
 
 
 def _options(job: Job, frames: Observation, **changes: Any) -> ReduceOptions:
@@ -89,9 +88,7 @@ def _options(job: Job, frames: Observation, **changes: Any) -> ReduceOptions:
     return ReduceOptions(**{**vars(job.options), **changes})
 
 
-def _with_disk(
-    frames: abc.Sequence[FrameFit], original: abc.Sequence[Observation]
-) -> list[FrameFit]:
+def _with_disk(frames: Sequence[FrameFit], original: Sequence[Observation]) -> list[FrameFit]:
     """The frames of a fit, with the extended light that was subtracted from them."""
     return [
         replace(frame, observation=replace(frame.observation, data=each.combined().data))
@@ -238,19 +235,17 @@ def _peak() -> int | None:
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
-_CONNECT = 30.0
+_CONNECT_SECONDS = 30.0
 """Seconds to wait for a scheduler."""
 
-_ALONE = "10 minutes"
+_WITHOUT_WORKER_TIME = "10 minutes"
 """Time without any worker on this machine after which jobs fail."""
 
-_PATIENCE = 20
+_FOLDER_WAIT_HALF_SECONDS = 20
 """Half seconds to wait for a folder that another machine has made: network disks lag."""
 
 
-def in_this_process(
-    todo: abc.Sequence[Job], jobs: Path, work: Work
-) -> Iterator[tuple[Job, Record]]:
+def in_this_process(todo: Sequence[Job], jobs: Path, work: Work) -> Iterator[tuple[Job, Record]]:
     """Run jobs one after the other; yields each with its record."""
     records: dict[str | None, Record] = {}
     for job in todo:
@@ -259,7 +254,7 @@ def in_this_process(
 
 
 def with_dask(
-    todo: abc.Sequence[Job],
+    todo: Sequence[Job],
     jobs: Path,
     work: Work,
     *,
@@ -288,7 +283,7 @@ def with_dask(
             stack.enter_context(config.set({
                 # A worker that is not back after this time is given up, by default after 15 s.
                 "distributed.deploy.lost-worker-timeout": "7 days",
-                "distributed.scheduler.no-workers-timeout": _ALONE,
+                "distributed.scheduler.no-workers-timeout": _WITHOUT_WORKER_TIME,
                 # Dask makes glibc give freed memory back at once, which slows fits down.
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
             }))  # fmt: skip
@@ -309,7 +304,7 @@ def with_dask(
                 ) from error
             address = stack.enter_context(cluster)
         try:
-            client = stack.enter_context(Client(address, timeout=_CONNECT))
+            client = stack.enter_context(Client(address, timeout=_CONNECT_SECONDS))
         except (OSError, ValueError) as error:
             raise IncompatibleSetupError(
                 f"scheduler: got {scheduler!r}, where none answers ({error}). Start one with `dask "
@@ -381,7 +376,7 @@ def _record_of(future: Any, job: Job, jobs: Path) -> Record:
 
 def _appears(final: Path) -> bool:
     """Whether a job that has finished elsewhere is seen here, perhaps after a while."""
-    for _ in range(_PATIENCE):
+    for _ in range(_FOLDER_WAIT_HALF_SECONDS):
         if finished(final):
             return True
         time.sleep(0.5)

@@ -23,10 +23,10 @@ from pyklip_diffrender.io.headers import file_name
 from pyklip_diffrender.scene.associations import listed_files
 from pyklip_diffrender.scene.sequence import epochs_of_files
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
-from pyklip_diffrender.wavefront.opd import wavefront_for
+from pyklip_diffrender.wavefront.opd import opd_for
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
-_DIGITS = 12
+_KEY_DIGITS = 12
 """Digits of the key at the end of the name of a folder."""
 
 
@@ -49,7 +49,7 @@ class Job:
     name: str
     # Frames.
     files: tuple[str, ...]
-    # Wavefront map.
+    # OPD map.
     opd: str
     # SHA-256 of every file that is read.
     inputs: Mapping[str, str]
@@ -136,7 +136,7 @@ def _jobs(
 def _epochs(
     sequence: SequenceConfig, files: list[Path]
 ) -> list[tuple[Path, str | None, str, str | None]]:
-    """Wavefront map, date, name and filter of every epoch; without a date if there is just one."""
+    """OPD map, date, name and filter of every epoch; without a date if there is just one."""
     of_folder = str(sequence.opd) != FLAT and sequence.opd.is_dir()
     try:
         epochs = epochs_of_files(files, target=sequence.target, filter=sequence.filter)
@@ -149,7 +149,7 @@ def _epochs(
     return [
         (
             # As `reduce` chooses it: the one nearest to the target's frames.
-            opd / wavefront_for(opd, each.date).name if of_folder else opd,
+            opd / opd_for(opd, each.date).name if of_folder else opd,
             each.date.isot if len(epochs) > 1 and each.date is not None else None,
             sequence.name if sequence.is_named else f"{each.target} {each.filter}",
             each.filter,
@@ -167,7 +167,7 @@ def _job(
     memory_limit: float | None,
 ) -> Job:
     options = sequence.options
-    pattern = str(options.systematics)
+    pattern = str(options.pattern)
     known = [] if pattern in ("auto", "references", "off") else _files((Path(pattern),))
     maps = [] if str(opd) == FLAT else [opd]
     # Members of associations are inputs as well.
@@ -181,9 +181,7 @@ def _job(
         "opd": inputs.get(str(opd), FLAT),
         "target": sequence.target,
         "filter": sequence.filter,
-        "systematics": (
-            inputs.get(pattern) or sorted(inputs[str(path)] for path in known) or pattern
-        ),
+        "pattern": (inputs.get(pattern) or sorted(inputs[str(path)] for path in known) or pattern),
         "epoch": epoch,
     }
     # Frames of reference stars for which there is no memory are left out.
@@ -209,7 +207,7 @@ def _with_planet(base: Job, planet: Injection) -> Job:
 
 def folder_of(label: str, key: str) -> str:
     """Name of a folder: what is in it, and the beginning of its key."""
-    return f"{file_name(label)}_{key[:_DIGITS]}"
+    return f"{file_name(label)}_{key[:_KEY_DIGITS]}"
 
 
 def hash_of(facts: Mapping[str, Any]) -> str:

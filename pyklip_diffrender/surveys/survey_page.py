@@ -22,7 +22,7 @@ from pyklip_diffrender.surveys.stars import StarSearch
 
 # The table of results: one row for each job.
 
-_AT = (0.5, 1.0, 1.5, 2.0)
+_AT_ARCSEC = (0.5, 1.0, 1.5, 2.0)
 """Separations of the limits, arcsec."""
 
 COLUMNS: dict[str, tuple[type, str]] = {
@@ -42,7 +42,10 @@ COLUMNS: dict[str, tuple[type, str]] = {
     "separation_arcsec": (float, "of that candidate from the star"),
     "position_angle_deg": (float, "of that candidate, east of north"),
     "contrast_error": (float, "standard deviation of contrast"),
-    **{f"limit_{each:.1f}_arcsec": (float, f"contrast limit at {each:g} arcsec") for each in _AT},
+    **{
+        f"limit_{each:.1f}_arcsec": (float, f"contrast limit at {each:g} arcsec")
+        for each in _AT_ARCSEC
+    },
     "injected_contrast": (float, ""),
     "injected_separation_arcsec": (float, ""),
     "injected_angle_deg": (float, ""),
@@ -64,9 +67,9 @@ may be masked.
 
 Contrasts come first, because a table that is too wide to print loses its middle."""
 
-_FORMATS = {"contrast": ".2e", "snr": ".1f"}
+_COLUMN_FORMATS = {"contrast": ".2e", "snr": ".1f"}
 
-_UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s, "bytes": u.byte}
+_COLUMN_UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s, "bytes": u.byte}
 """Units by the last word of the name of a column; limits are contrasts at the separation there."""
 
 
@@ -107,9 +110,9 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
         values = [each[name] for each in rows]
         known = [kind() if value is None else kind(value) for value in values]
         table[name] = MaskedColumn(known, mask=[value is None for value in values], dtype=kind)
-        table[name].info.format = _FORMATS.get(name)
+        table[name].info.format = _COLUMN_FORMATS.get(name)
         if not name.startswith("limit_"):
-            table[name].unit = _UNITS.get(name.rpartition("_")[2])
+            table[name].unit = _COLUMN_UNITS.get(name.rpartition("_")[2])
         table[name].description = description
     return table
 
@@ -132,7 +135,7 @@ def write_tables(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
 
 Jobs = Sequence[tuple[Job, Record | None]]
 
-_NAMES = 3
+_MOST_TITLE_NAMES = 3
 """Most sequences that the title names."""
 
 
@@ -150,7 +153,7 @@ def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
     injected = sum(job.injection is not None for job, _ in jobs)
     return render(
         "survey.html",
-        name=f"Survey of {', '.join(names) if len(names) <= _NAMES else more}",
+        name=f"Survey of {', '.join(names) if len(names) <= _MOST_TITLE_NAMES else more}",
         version=__version__,
         now=datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
         sentence=_sentence(jobs),
@@ -173,7 +176,9 @@ def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
         rows=rows,
         pictures=_pictures(jobs),
         separations=[
-            each for each in _AT if any(row[f"limit_{each:.1f}_arcsec"] is not None for row in rows)
+            each
+            for each in _AT_ARCSEC
+            if any(row[f"limit_{each:.1f}_arcsec"] is not None for row in rows)
         ],
         candidates=[
             {"job": job, "target": result["target"], **each}

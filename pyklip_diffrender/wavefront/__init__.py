@@ -1,4 +1,4 @@
-"""Wavefront maps, the modes that describe their changes, and priors on the modes."""
+"""OPD maps, the modes that describe their changes, and priors on the modes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pyklip_diffrender.wavefront.bases import (
 from pyklip_diffrender.wavefront.opd import (
     RULES,
     as_opd_map,
-    choose_map,
+    choose_opd,
+    opd_for,
     random_drift,
     random_opd,
     read_opd,
-    wavefront_for,
 )
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior, solve_with_evidence
@@ -31,13 +31,13 @@ __all__ = [
     "SegmentMotions",
     "WavefrontPrior",
     "as_opd_map",
-    "choose_map",
+    "choose_opd",
     "default_basis",
     "interpolate_wss",
     "learn_prior",
+    "opd_for",
     "random_drift",
     "random_opd",
     "read_opd",
     "solve_with_evidence",
-    "wavefront_for",
 ]

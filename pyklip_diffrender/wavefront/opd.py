@@ -1,4 +1,4 @@
-"""Wavefront maps: read from FITS files, drawn at random, or chosen by date from a folder."""
+"""OPD maps: read from FITS files, drawn at random, or chosen by date from a folder."""
 
 from __future__ import annotations
 
@@ -106,11 +106,11 @@ def read_opd(
     path = Path(path)
     if path.is_dir():
         raise CorruptFileError(
-            f"{path} is a folder, expected a file. choose_map(folder, date) takes the map of a "
+            f"{path} is a folder, expected a file. choose_opd(folder, date) takes the map of a "
             "folder that is nearest to a date"
         )
     if not path.exists():
-        raise MissingFileError(f"{path}: no such file, expected a wavefront map")
+        raise MissingFileError(f"{path}: no such file, expected an OPD map")
     with open_fits(path) as hdus:
         if extension is None and EXTENSION in hdus:
             return _checked(load_wss_opd(path))
@@ -168,7 +168,7 @@ def _image(hdus: fits.HDUList, extension: str | int | None, path: Path) -> Any:
         if product:
             what = f"{product}, a product of pyklip_diffrender"
         raise CorruptFileError(
-            f"{path.name}: this is no wavefront map, but {what}. Expected a map of the wavefront "
+            f"{path.name}: this is no OPD map, but {what}. Expected a map of the wavefront "
             "sensing (R2022081102-NRCA3_FP1-1.fits, for example) or another OPD map. Give "
             "exposures as frames instead"
         )
@@ -246,7 +246,7 @@ def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
     Examples
     --------
     >>> import pyklip_diffrender as dr
-    >>> opd = dr.random_opd(1, npix=128, rms=50e-9)
+    >>> opd = dr.wavefront.random_opd(1, npix=128, rms=50e-9)
     >>> f"{1e9 * opd.data[opd.data != 0].std():.0f} nm"
     '50 nm'
     """
@@ -288,7 +288,7 @@ def _random(seed: int, npix: int, rms: float, segment_variance: float, name: str
     return OPDMap(data, None, f"{name}(seed={seed})", hashlib.sha256(data.tobytes()).hexdigest())
 
 
-# Choose a wavefront map by its date, from a folder of maps.
+# Choose an OPD map by its date, from a folder of maps.
 
 _log = logging.getLogger(__name__)
 
@@ -301,14 +301,14 @@ OUTDATED_DAYS = 200.0
 every few weeks to months, so that such a map is of another state of the mirror."""
 
 
-def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "nearest") -> OPDMap:
-    """Choose a wavefront map from a folder by its date.
+def choose_opd(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "nearest") -> OPDMap:
+    """Choose an OPD map from a folder by its date.
 
     Parameters
     ----------
     folder : path
         Wavefront-sensing files of MAST, stpsf's files and other maps may be mixed. The date of a
-        map is in its header, else in the file's name. Files that are not wavefront maps, and maps
+        map is in its header, else in the file's name. Files that are not OPD maps, and maps
         without a date, are skipped with a message to the log. So are the maps that stpsf leaves
         out: analyses with known faults, and sensing in F187N. Of several analyses of one sensing
         the last is used.
@@ -342,8 +342,8 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     --------
     With a folder of maps, which the package does not contain:
 
-    >>> from pyklip_diffrender import choose_map
-    >>> opd = choose_map("maps", "2022-07-30T12:00", rule="before")  # doctest: +SKIP
+    >>> from pyklip_diffrender import choose_opd
+    >>> opd = choose_opd("maps", "2022-07-30T12:00", rule="before")  # doctest: +SKIP
     """
     if rule not in RULES:
         raise IncompatibleSetupError(f"rule: got {rule!r}, expected one of {', '.join(RULES)}")
@@ -355,7 +355,7 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     wanted = sides.get(rule) or [min(maps, key=lambda each: abs(each[0] - when))]
     if None in wanted:
         raise MissingOPDError(
-            f"{folder}: no wavefront map was sensed {'before' if before is None else 'after'} "
+            f"{folder}: no OPD map was sensed {'before' if before is None else 'after'} "
             f"{when.isot[:19]}; the {len(maps)} maps are of {min(maps)[0].isot[:10]} to "
             f"{max(maps)[0].isot[:10]}. The rule 'nearest' takes one of them"
         )
@@ -367,7 +367,7 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
         _warn_if_outdated(opd, when)
     opd = chosen[0] if len(chosen) == 1 else _interpolated(chosen[0], chosen[1], when)
     note = f"{rule} of {len(maps)} maps: {', '.join(notes)} {when.isot[:19]}"
-    _log.info("wavefront map %s", note)
+    _log.info("OPD map %s", note)
     replaced = [
         f"{path.name} is the last analysis of its sensing, in place of {', '.join(earlier)}"
         for path in paths
@@ -396,19 +396,19 @@ def _last_analyses(
     return last, superseded
 
 
-def wavefront_for(opd: Any, date: Time | None) -> OPDMap:
+def opd_for(opd: Any, date: Time | None) -> OPDMap:
     """The wavefront for frames of a date: as `as_opd_map`, or the nearest map in a folder.
 
-    Raises what `choose_map` and `read_opd` raise, and IncompatibleSetupError for a folder if the
+    Raises what `choose_opd` and `read_opd` raise, and IncompatibleSetupError for a folder if the
     date of the frames is not known; warns if the map is more than 200 days from the date.
     """
     if isinstance(opd, str | os.PathLike) and opd != FLAT and Path(opd).is_dir():
         if date is None:
             raise IncompatibleSetupError(
-                f"{opd} is a folder of wavefront maps, and the frames have no date (DATE-BEG) to "
+                f"{opd} is a folder of OPD maps, and the frames have no date (DATE-BEG) to "
                 "choose one by. Give the file of the map"
             )
-        return choose_map(opd, date)
+        return choose_opd(opd, date)
     wavefront = as_opd_map(opd)
     if date is not None:
         _warn_if_outdated(wavefront, date)
@@ -416,9 +416,9 @@ def wavefront_for(opd: Any, date: Time | None) -> OPDMap:
 
 
 def dated_maps(folder: Path) -> list[tuple[Time, Path]]:
-    """Date and path of every wavefront map in a folder."""
+    """Date and path of every OPD map in a folder."""
     if not folder.is_dir():
-        raise MissingOPDError(f"{folder}: no such folder, expected a folder of wavefront maps")
+        raise MissingOPDError(f"{folder}: no such folder, expected a folder of OPD maps")
     files = fits_files(folder)
     maps = []
     for path in files:
@@ -430,14 +430,14 @@ def dated_maps(folder: Path) -> list[tuple[Time, Path]]:
             _log.info("%s is skipped: %s", path.name, error.args[0])
     if not maps:
         raise MissingOPDError(
-            f"{folder}: none of its {len(files)} FITS files is a wavefront map with a date, "
+            f"{folder}: none of its {len(files)} FITS files is an OPD map with a date, "
             "expected DATE-OBS in the header or a name such as opd_2022-08-14.fits"
         )
     return maps
 
 
 def _date_of_map(path: Path) -> Time:
-    """Date of a wavefront map, from its headers alone; LookupError if it has none or is no map."""
+    """Date of an OPD map, from its headers alone; LookupError if it has none or is no map."""
     try:
         # Headers only, because a folder may hold hundreds of files.
         with (
@@ -466,7 +466,7 @@ def _date_of_map(path: Path) -> Time:
             raise LookupError(reason)
     unit = header_text(header, "BUNIT", path.name)
     if not (sensed or _is_length(unit)):
-        raise LookupError(f"its image is not a wavefront map: BUNIT is {unit!r}")
+        raise LookupError(f"its image is not an OPD map: BUNIT is {unit!r}")
     date = sensing_date(header, path.name)
     if date is None:
         raise LookupError("it has no date in its header nor in its name")

@@ -1,4 +1,4 @@
-"""`OPDMap`: a wavefront map together with its origin, checks that it is plausible, and export."""
+"""`OPDMap`: an OPD map together with its origin, checks that it is plausible, and export."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLAT = "flat"
 
 @dataclass(frozen=True)
 class OPDMap:
-    """A wavefront map together with its origin.
+    """An OPD map together with its origin.
 
     Attributes
     ----------
@@ -69,14 +69,14 @@ class OPDMap:
         return "" if days is None else f"{abs(days):.1f} days {'after' if days > 0 else 'before'}"
 
 
-# Plausibility checks of wavefront maps, and their export as HDULists for poppy and stpsf.
+# Plausibility checks of OPD maps, and their export as HDULists for poppy and stpsf.
 
 Array = NDArray[np.float64]
 
 LARGEST_RMS = 2e-5
 """m; with a worse wavefront a telescope makes no image in the infrared."""
 
-_TURNS: dict[str, Any] = {
+_ORIENTATIONS: dict[str, Any] = {
     "as it is": lambda a: a,
     "upside down": np.flipud,
     "left to right": np.fliplr,
@@ -104,7 +104,7 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
     filled = (opd != 0) & np.isfinite(opd)
     if filled.all() or not filled.any():
         return
-    mismatch = {turn: float(np.mean(act(filled) != inside)) for turn, act in _TURNS.items()}
+    mismatch = {turn: float(np.mean(act(filled) != inside)) for turn, act in _ORIENTATIONS.items()}
     best = min(mismatch, key=lambda turn: mismatch[turn])
     if mismatch[best] < 0.5 * mismatch["as it is"]:
         warnings.warn(

@@ -23,7 +23,7 @@ from pyklip_diffrender.io.units import set_numbers, to_metres, to_number
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import Basis
 
-_ROUNDING = 1e-12
+_CURVATURE_ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
 
 _SCALE_LIMITS = (1e-4, 100.0)
@@ -31,11 +31,11 @@ _SCALE_LIMITS = (1e-4, 100.0)
 zero; without a ceiling, a bright companion that is missing from the model makes the prior so wide
 that the equations cannot be solved."""
 
-_RIDGE = 1e-3
+_MODES_RIDGE = 1e-3
 """Ridge of the fit of modes to maps, relative to the norms of the modes. Modes that are degenerate
 on the mirror share what they explain."""
 
-_ENOUGH_MODES = 20.0
+_FEWEST_DETERMINED_MODES = 20.0
 """Smallest number of determined modes that constrain the scale of a group."""
 
 
@@ -66,7 +66,7 @@ class WavefrontPrior:
     --------
     >>> from astropy import units as u
     >>> import pyklip_diffrender as dr
-    >>> dr.WavefrontPrior(scales={"segment": 2 * u.nm, "texture": 0.1}).scales
+    >>> dr.wavefront.WavefrontPrior(scales={"segment": 2 * u.nm, "texture": 0.1}).scales
     {'segment': 2.0, 'texture': 0.1}
     """
 
@@ -119,7 +119,7 @@ class WavefrontPrior:
 
         Examples
         --------
-        >>> from pyklip_diffrender import WavefrontPrior
+        >>> from pyklip_diffrender.wavefront import WavefrontPrior
         >>> WavefrontPrior({"segment": 2.0, "texture": 0.1}).widened({"segment": 1.5}).scales
         {'segment': 3.0, 'texture': 0.1}
         """
@@ -156,7 +156,7 @@ def learn_prior(
     diameter: float = JWST_DIAMETER,
     npix: int = 128,
 ) -> WavefrontPrior:
-    """Derive a prior from the differences of successive wavefront maps.
+    """Derive a prior from the differences of successive OPD maps.
 
     Parameters
     ----------
@@ -183,8 +183,8 @@ def learn_prior(
     --------
     >>> import pyklip_diffrender as dr
     >>> from pyklip_diffrender.wavefront.bases import FourierModes
-    >>> maps = [dr.random_opd(seed, npix=128).data for seed in (1, 2, 3)]
-    >>> prior = dr.learn_prior(maps, FourierModes(4))
+    >>> maps = [dr.wavefront.random_opd(seed, npix=128).data for seed in (1, 2, 3)]
+    >>> prior = dr.wavefront.learn_prior(maps, FourierModes(4))
     >>> list(prior.scales), prior.fit_scales
     (['texture'], True)
     """
@@ -198,7 +198,7 @@ def learn_prior(
     lit = torch.from_numpy(np.abs(averaged).max(axis=0) > 0)
     inside = basis.modes(grid, 0, len(basis))[:, lit]
     system = inside @ inside.T
-    system.diagonal().mul_(1 + _RIDGE)
+    system.diagonal().mul_(1 + _MODES_RIDGE)
     right = inside @ torch.from_numpy(averaged)[:, lit].T
     coefficients = torch.linalg.solve(system, right).square().mean(dim=1).sqrt().numpy()
     frequency, group = basis.frequencies.numpy(), basis.group_index.numpy()
@@ -279,7 +279,7 @@ def solve_with_evidence(
         precision = deviation**-2
         system = curvature.clone()
         # Rounding errors of the curvature can exceed the precision of a wide prior.
-        system.diagonal().mul_(1 + _ROUNDING).add_((1 + damping) * precision)
+        system.diagonal().mul_(1 + _CURVATURE_ROUNDING).add_((1 + damping) * precision)
         factor = torch.linalg.cholesky(system)
         del system  # Of thousands of unknowns, each matrix takes 100 MB or more.
         log_determinant = 2 * factor.diagonal().log().sum()
@@ -316,4 +316,6 @@ def scale_ratios(step: Tensor, variance: Tensor, deviation: Tensor, group: Tenso
     determined = torch.zeros(count, dtype=step.dtype)
     determined.index_add_(0, group, 1 - variance / deviation**2)
     size = torch.zeros_like(determined).index_add_(0, group, (step / deviation) ** 2)
-    return torch.where(determined > _ENOUGH_MODES, (size / determined).clamp(min=0).sqrt(), 1.0)
+    return torch.where(
+        determined > _FEWEST_DETERMINED_MODES, (size / determined).clamp(min=0).sqrt(), 1.0
+    )

@@ -130,16 +130,16 @@ F212N, for which the sensing terms are (stpsf 2.2, ``mast_wss.infer_pre_or_post_
 _NEVER_F187N = ("V01163111001", "V01445")
 """Visits, or beginnings of their names, that never sense in F187N (ibid.)."""
 
-_NAME = re.compile(r"([A-Z]\d{10})-\w+?-(\d+)(?=\.|$)")
+_MAST_NAME = re.compile(r"([A-Z]\d{10})-\w+?-(\d+)(?=\.|$)")
 """Correction and number of the analysis in the name of a file of MAST."""
 
-_WINDOWS = (3.0, 6.0, 12.0)
+_SEARCH_WINDOWS_DAYS = (3.0, 6.0, 12.0)
 """Days around a date in which MAST is asked for maps; they are sensed every two to four days."""
 
 
 def analysis_of(name: str) -> tuple[str, int]:
     """Key by which the analyses of one sensing are sorted, the last one at the end."""
-    match = _NAME.search(name)
+    match = _MAST_NAME.search(name)
     # The letter says who asked for the correction; its number counts the day's.
     return (name, 0) if match is None else (match[1][1:], int(match[2]))
 
@@ -307,7 +307,7 @@ def load_wss_opd_by_date(
     except (OSError, RuntimeError, ValueError, LookupError, TypeError) as error:
         # No network, an answer from a proxy instead of the service, or no map within a week.
         raise MissingOPDError(
-            f"no wavefront map for {when.isot} from MAST ({type(error).__name__}: {error}). "
+            f"no OPD map for {when.isot} from MAST ({type(error).__name__}: {error}). "
             "Where the network does not allow it, download the file elsewhere "
             "(https://mast.stsci.edu, product type OPD) and pass its path to load_wss_opd, or "
             "give it as opd"
@@ -321,7 +321,7 @@ def _names_in_archive(mast_wss: Any, when: Time, choice: str) -> list[str]:
 
     `LookupError` if there are none within twelve days on the side that is asked for.
     """
-    for days in _WINDOWS:
+    for days in _SEARCH_WINDOWS_DAYS:
         # The last analysis of each sensing.
         rows: dict[float, str] = {}
         for row in mast_wss.mast_wss_date_query(when, days * u.day):
@@ -340,9 +340,9 @@ def _names_in_archive(mast_wss: Any, when: Time, choice: str) -> list[str]:
         wanted = sides.get(choice, [nearest])
         # The nearest is known where there are some on both sides.
         sure = choice in sides or (before is not None and after is not None)
-        if None not in wanted and (sure or days == _WINDOWS[-1]):
+        if None not in wanted and (sure or days == _SEARCH_WINDOWS_DAYS[-1]):
             return [rows[t] for t in sorted({t for t in wanted if t is not None})]
-    raise LookupError(f"no map {choice} that date within {_WINDOWS[-1]:g} days")
+    raise LookupError(f"no map {choice} that date within {_SEARCH_WINDOWS_DAYS[-1]:g} days")
 
 
 def interpolate_wss(before: OPDMap, after: OPDMap, date: str | Time) -> OPDMap:

@@ -30,7 +30,7 @@ def wavefront():
 
 
 def opd_map():
-    """A wavefront map."""
+    """An OPD map."""
     hdu = fits.PrimaryHDU(wavefront())
     hdu.header.update({"BUNIT": "m", "DATE-OBS": "2022-08-11T01:02:03"})
     return fits.HDUList([hdu])

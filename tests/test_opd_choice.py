@@ -1,4 +1,4 @@
-"""Choosing a wavefront map by its date."""
+"""Choosing an OPD map by its date."""
 
 import logging
 
@@ -12,8 +12,8 @@ from pyklip_diffrender import errors
 from pyklip_diffrender.io import sensing_date
 from pyklip_diffrender.optics import resample
 from pyklip_diffrender.reduction import ReduceOptions, prepare
-from pyklip_diffrender.scene import Observation, Sequence
-from pyklip_diffrender.wavefront import choose_map, random_opd, read_opd, wavefront_for
+from pyklip_diffrender.scene import ExposureSequence, Observation
+from pyklip_diffrender.wavefront import choose_opd, opd_for, random_opd, read_opd
 
 NPIX = 64
 
@@ -55,7 +55,7 @@ def folder(tmp_path_factory):
     ],
 )
 def test_the_rule_decides(folder, date, rule, name, note):
-    opd = choose_map(folder, date, rule)
+    opd = choose_opd(folder, date, rule)
     assert opd.name == name
     assert np.array_equal(opd.data, read_opd(folder / name).data)
     assert note in opd.history[-1]
@@ -67,7 +67,7 @@ def test_interpolation_is_linear_in_time_at_the_finer_sampling(tmp_path):
     write_map(tmp_path / "a_2022-08-01.fits", 1, npix=32)
     write_map(tmp_path / "b_2022-08-11.fits", 2, npix=64)
     with pytest.warns(errors.DiffrenderWarning, match=r"interpolation, 80% of a_2022-08-01\.fits"):
-        opd = choose_map(tmp_path, "2022-08-03", "interpolate")
+        opd = choose_opd(tmp_path, "2022-08-03", "interpolate")
     first, second = (read_opd(path).data for path in sorted(tmp_path.iterdir()))
     np.testing.assert_allclose(opd.data, 0.8 * resample(first, 64) + 0.2 * second, atol=1e-18)
     assert opd.date == Time("2022-08-03")
@@ -81,7 +81,7 @@ def test_interpolation_is_linear_in_time_at_the_finer_sampling(tmp_path):
 )
 def test_no_map_on_that_side(folder, date, rule, side):
     with pytest.raises(errors.MissingOPDError, match=rf"{side} {date}.*2022-08-01 to 2022-08-21"):
-        choose_map(folder, date, rule)
+        choose_opd(folder, date, rule)
 
 
 def test_other_files_are_skipped_and_logged(tmp_path, caplog):
@@ -93,7 +93,7 @@ def test_other_files_are_skipped_and_logged(tmp_path, caplog):
     (tmp_path / "cut_2022-08-05.fits").write_bytes(cut)
     (tmp_path / "notes_2022-08-05.txt").write_text("nothing")
     with caplog.at_level(logging.INFO):
-        assert choose_map(tmp_path, "2022-08-05").name == "first.fits"
+        assert choose_opd(tmp_path, "2022-08-05").name == "first.fits"
     said = {record.args[0]: record.getMessage() for record in caplog.records if record.args}
     assert "no date" in said["undated.fits"]
     assert "BUNIT is 'MJy/sr'" in said["frames_2022-08-05.fits"]
@@ -104,7 +104,7 @@ def test_other_files_are_skipped_and_logged(tmp_path, caplog):
 
 def test_without_any_map_it_is_an_error(tmp_path):
     with pytest.raises(errors.MissingOPDError, match=r"none of its 0 FITS files"):
-        choose_map(tmp_path, "2022-08-05")
+        choose_opd(tmp_path, "2022-08-05")
     write_map(tmp_path / "undated.fits", 4)
     for folder, rule, error, words in (
         (tmp_path, "nearest", errors.MissingOPDError, r"none of its 1 FITS files.*DATE-OBS"),
@@ -112,7 +112,7 @@ def test_without_any_map_it_is_an_error(tmp_path):
         (tmp_path, "closest", errors.IncompatibleSetupError, "'closest', expected one of nearest"),
     ):
         with pytest.raises(error, match=words):
-            choose_map(folder, "2022-08-05", rule)
+            choose_opd(folder, "2022-08-05", rule)
 
 
 def test_of_one_sensing_the_last_analysis_is_used(tmp_path, caplog):
@@ -121,7 +121,7 @@ def test_of_one_sensing_the_last_analysis_is_used(tmp_path, caplog):
         name = f"R2022081102-NRCA3_FP1-{number}.fits"
         wss_file(tmp_path / name, seed=number, date="2022-08-11T12:00:00")
     write_map(tmp_path / "opd.fits", 1, DATE_OBS="2022-08-01", TIME_OBS="12:00:00")
-    opd = choose_map(tmp_path, "2022-08-12", "before")
+    opd = choose_opd(tmp_path, "2022-08-12", "before")
     assert opd.name == "R2022081102-NRCA3_FP1-10.fits"
     assert np.array_equal(opd.data, read_opd(tmp_path / opd.name).data)
     said = "in place of R2022081102-NRCA3_FP1-1.fits, R2022081102-NRCA3_FP1-2.fits"
@@ -129,7 +129,7 @@ def test_of_one_sensing_the_last_analysis_is_used(tmp_path, caplog):
     assert said in caplog.text
     # A later correction of it.
     wss_file(tmp_path / "O2022081103-NRCA3_FP1-1.fits", date="2022-08-11T12:00:00")
-    assert choose_map(tmp_path, "2022-08-11").name == "O2022081103-NRCA3_FP1-1.fits"
+    assert choose_opd(tmp_path, "2022-08-11").name == "O2022081103-NRCA3_FP1-1.fits"
 
 
 @pytest.mark.parametrize(
@@ -148,24 +148,24 @@ def test_maps_that_stpsf_leaves_out_are_skipped(tmp_path, caplog, cards, name, r
     for given, chosen in ((cards, "R2022081102-NRCA3_FP1-1.fits"), (good, name)):
         with fits.open(tmp_path / name, mode="update") as hdus:
             hdus[0].header.update(given)
-        assert choose_map(tmp_path, "2022-08-31").name == chosen
+        assert choose_opd(tmp_path, "2022-08-31").name == chosen
     assert reason in caplog.text
 
 
 def test_a_map_of_another_epoch_is_a_warning_with_the_days(folder):
     with pytest.warns(errors.DiffrenderWarning, match=r"opd_2022-08-21\.fits.* 223 days before"):
-        choose_map(folder, "2023-04-01")
+        choose_opd(folder, "2023-04-01")
     path = folder / "opd_2022-08-21.fits"
     with pytest.warns(errors.DiffrenderWarning, match=r" 232 days after the frames of 2022-01-01"):
-        wavefront_for(path, Time("2022-01-01"))
-    assert wavefront_for(path, Time("2022-08-01")).name == path.name
+        opd_for(path, Time("2022-01-01"))
+    assert opd_for(path, Time("2022-08-01")).name == path.name
 
 
 def test_a_folder_needs_the_date_of_the_frames(folder):
-    assert wavefront_for(folder, Time("2022-08-01")).name == "first.fits.gz"
+    assert opd_for(folder, Time("2022-08-01")).name == "first.fits.gz"
     with pytest.raises(errors.IncompatibleSetupError, match="the frames have no date"):
-        wavefront_for(folder, None)
-    with pytest.raises(errors.CorruptFileError, match=r"is a folder.*choose_map"):
+        opd_for(folder, None)
+    with pytest.raises(errors.CorruptFileError, match=r"is a folder.*choose_opd"):
         read_opd(folder)
 
 
@@ -173,7 +173,7 @@ def test_a_reduction_takes_the_nearest_map_of_a_folder(folder):
     ones, facts = np.ones((8, 8)), {"pixelscale": 0.063, "filter": "F444W"}
     dates = (Time("2022-08-10"), Time("2022-08-18"))
     frames = tuple(Observation.from_arrays(ones, ones, date=date, **facts) for date in dates)
-    sequence = Sequence("star", frames)
+    sequence = ExposureSequence("star", frames)
     assert sequence.date == Time("2022-08-14")
     prepared = prepare(sequence, folder, ReduceOptions(size=8))
     assert prepared.wavefront.name == "R2022081102-NRCA3_FP1-1.fits"

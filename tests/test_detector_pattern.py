@@ -17,8 +17,8 @@ from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.pattern import measure
 from pyklip_diffrender.refinement import Status, refine_again
-from pyklip_diffrender.scene import Observation, Planet, Systematics
-from pyklip_diffrender.scene.systematics import require_pattern_of
+from pyklip_diffrender.scene import DetectorPattern, Observation, Planet
+from pyklip_diffrender.scene.detector_pattern import require_pattern_of
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
 
 NPIX, SIZE = 64, 32
@@ -37,7 +37,7 @@ def frame(shape, center, **details):
 def test_pixels_are_matched_by_the_star(shape):
     """Cutouts that stick out on every side, or do not meet the pattern at all."""
     pattern = 1.0 + np.arange(9 * 12).reshape(9, 12)
-    known = Systematics(pattern, 0.01 * pattern, (6.0, 4.0), unknown=0.5)
+    known = DetectorPattern(pattern, 0.01 * pattern, (6.0, 4.0), unknown=0.5)
     for x, y in product([-12.0, -3.0, 0.3, 5.0, 40.0], [-25.0, -2.0, 0.0, 9.0]):
         got, error = known.at(frame(shape, (6.0 + x, 4.0 + y)))
         assert got.shape == error.shape == shape
@@ -53,7 +53,7 @@ def test_pixels_are_matched_on_the_detector_where_both_know_theirs(corner):
     """A pixel keeps its flat field wherever in the frame the star is."""
     rows, columns = np.mgrid[1600:1609, 600:612]
     serial = 1.0 + 1000 * rows + columns
-    measured = Systematics(serial, 0.01 * serial, (6.0, 4.0), 0.5, first_pixel=(600, 1600))
+    measured = DetectorPattern(serial, 0.01 * serial, (6.0, 4.0), 0.5, first_pixel=(600, 1600))
     got, error = measured.at(frame((10, 8), (1.0, 7.0), first_pixel=corner))
     rows, columns = np.mgrid[corner[1] : corner[1] + 10, corner[0] : corner[0] + 8]
     known = (rows >= 1600) & (rows < 1609) & (columns >= 600) & (columns < 612)
@@ -65,14 +65,14 @@ def test_pixels_are_matched_on_the_detector_where_both_know_theirs(corner):
 
 def test_another_filter_and_unequal_arrays_are_refused():
     zeros = np.zeros((9, 12))
-    known = Systematics(zeros, zeros, (6.0, 4.0), 0.5, filter="F444W")
+    known = DetectorPattern(zeros, zeros, (6.0, 4.0), 0.5, filter="F444W")
     require_pattern_of(known, frame((9, 12), (6.0, 4.0), filter="F444W"))
     # Nothing says that they do not go together.
     require_pattern_of(known, frame((9, 12), (6.0, 4.0)))
-    with pytest.raises(IncompatibleSetupError, match=r"'systematics'.*F444W.*F356W"):
+    with pytest.raises(IncompatibleSetupError, match=r"'pattern'.*F444W.*F356W"):
         require_pattern_of(known, frame((9, 12), (6.0, 4.0), filter="F356W"))
     with pytest.raises(ShapeError, match=r"\(9, 12\) and \(9, 11\)"):
-        Systematics(zeros, zeros[:, 1:], (6.0, 4.0), 0.5)
+        DetectorPattern(zeros, zeros[:, 1:], (6.0, 4.0), 0.5)
 
 
 @cache
@@ -93,7 +93,9 @@ def light():
 
 
 def known(error=1e-3, seed=1):
-    return Systematics(pattern(seed), np.full((SIZE, SIZE), error), MIDDLE, RMS, name="measured")
+    return DetectorPattern(
+        pattern(seed), np.full((SIZE, SIZE), error), MIDDLE, RMS, name="measured"
+    )
 
 
 @pytest.mark.slow
@@ -101,7 +103,7 @@ def test_a_pattern_hides_planets_and_is_taken_out_where_it_is_known():
     planet = Planet(8e-6, 0.6, 300.0)
     spoilt = star().observed(light() * (1 + pattern()) + star().light(planet), 50)
     without, with_it, wrong = (
-        star().refined(spoilt, systematics=each) for each in (None, known(), known(seed=2))
+        star().refined(spoilt, pattern=each) for each in (None, known(), known(seed=2))
     )
     assert without.status is wrong.status is Status.MODEL_MISMATCH
     assert min(without.reduced_chi2, wrong.reduced_chi2) > 30
@@ -122,9 +124,9 @@ def test_a_pattern_hides_planets_and_is_taken_out_where_it_is_known():
     assert np.sqrt(np.mean(away**2)) < 0.6
     rendered = frame.values["background"][0] + frame.gain * frame.render(background=False)
     np.testing.assert_allclose(rendered, frame.star, rtol=1e-9)
-    assert with_it.summary()["systematics"] == "measured"
+    assert with_it.summary()["pattern"] == "measured"
     # It is part of what goes on from the fit.
-    assert refine_again(with_it, max_iterations=2).systematics is with_it.systematics
+    assert refine_again(with_it, max_iterations=2).pattern is with_it.pattern
 
 
 @pytest.mark.slow
@@ -132,7 +134,7 @@ def test_the_error_of_a_pattern_counts_as_noise():
     """The frames' own pattern differs from the one that was measured, by what its error says."""
     drawn = 0.02 * np.random.default_rng(8).normal(size=(SIZE, SIZE))
     spoilt = star().observed(light() * (1 + pattern() + drawn) + star().light(PLANET), 51)
-    honest, sure = (star().refined(spoilt, systematics=known(error)) for error in (0.02, 1e-6))
+    honest, sure = (star().refined(spoilt, pattern=known(error)) for error in (0.02, 1e-6))
     assert honest.status is Status.CONVERGED
     assert honest.reduced_chi2 == pytest.approx(1.0, abs=0.13)
     assert sure.reduced_chi2 > 3
@@ -150,7 +152,7 @@ def test_frames_fitted_together_have_the_pattern_each_at_its_star():
         moved = star().star(detector_shift=(x * scale[0], y * scale[1]))
         expected = moved * (1 + np.roll(pattern(), (y, x), axis=(0, 1)))
         frames.append(star().observed(expected, 60 + k, center=(MIDDLE[0] + x, MIDDLE[1] + y)))
-    fit = star().refined(frames, systematics=known())
+    fit = star().refined(frames, pattern=known())
     assert fit.status is Status.CONVERGED
     assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.1)
     np.testing.assert_array_equal(fit.frames[1].gain[1:, 2:], 1 + pattern()[:-1, :-2])
@@ -160,21 +162,21 @@ def test_frames_fitted_together_have_the_pattern_each_at_its_star():
 def test_frames_tell_how_much_of_a_pattern_they_show(size, caplog):
     """Another flat field may have removed a part of the pattern, or all of it."""
     spoilt = star().observed(light() * (1 + size * pattern()) + star().light(PLANET), 53)
-    fit = star().refined(spoilt, systematics=known(0.01))
+    fit = star().refined(spoilt, pattern=known(0.01))
     measured = measure.pattern_size(fit)
     assert measured[0] == pytest.approx(size, abs=0.1)
     assert 0 < measured[1] < 0.05
     assert measure.lacks_pattern(fit) is (size < 0.5)
     warnings = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
     assert len(warnings) == (size < 0.5)
-    assert all("flat-field pattern of measured" in each for each in warnings)
+    assert all("detector pattern of measured" in each for each in warnings)
 
 
 def test_a_fit_without_a_known_pattern_says_nothing_about_it():
     spoilt = star().observed(light(), 54)
     zeros = np.zeros((SIZE, SIZE))
-    for systematics in (None, Systematics(zeros, zeros + 0.01, MIDDLE, RMS)):
-        fit = star().refined(spoilt, systematics=systematics)
+    for pattern in (None, DetectorPattern(zeros, zeros + 0.01, MIDDLE, RMS)):
+        fit = star().refined(spoilt, pattern=pattern)
         assert measure.pattern_size(fit) is None
         assert not measure.lacks_pattern(fit)
 
@@ -194,8 +196,8 @@ def rolls(pedestal=0.0):
 def test_a_single_roll_may_show_more_of_a_structure_than_the_pattern_says():
     flat = 0.01 * np.random.default_rng(6).normal(size=(SIZE, SIZE))
     flat[21:24, 22:25] += 0.08
-    drawn = Systematics(flat, 0.1 * abs(flat), MIDDLE, 0.01, first_pixel=(600, 1600))
-    fits = [star().refined(frames, systematics=drawn) for frames in (rolls()[0], rolls())]
+    drawn = DetectorPattern(flat, 0.1 * abs(flat), MIDDLE, 0.01, first_pixel=(600, 1600))
+    fits = [star().refined(frames, pattern=drawn) for frames in (rolls()[0], rolls())]
     single, both = (Maps(groups_of([fit])) for fit in fits)
     ((linear, templates),) = single.groups
     planet = templates.at_pixels(np.array([22]), np.array([23]))[0][0].numpy()
@@ -209,9 +211,9 @@ def test_a_single_roll_may_show_more_of_a_structure_than_the_pattern_says():
 
 def test_frames_of_the_same_pixels_share_what_is_unknown_of_the_pattern():
     zeros = np.zeros((SIZE, SIZE))
-    unknown = Systematics(zeros, zeros + 0.5 * RMS, MIDDLE, RMS, first_pixel=(600, 1600))
+    unknown = DetectorPattern(zeros, zeros + 0.5 * RMS, MIDDLE, RMS, first_pixel=(600, 1600))
     shared, apart = (
-        star().refined(frames, systematics=unknown)
+        star().refined(frames, pattern=unknown)
         for frames in (rolls(), [replace(roll, first_pixel=None) for roll in rolls()])
     )
     assert shared.status is Status.CONVERGED
@@ -242,14 +244,14 @@ def test_frames_of_the_same_pixels_share_what_is_unknown_of_the_pattern():
 @pytest.mark.slow
 def test_the_pattern_multiplies_the_pedestal(tmp_path):
     pedestal = 1e4
-    measured = Systematics(
+    measured = DetectorPattern(
         0.5 * pattern(), np.full((SIZE, SIZE), 1e-3), MIDDLE, RMS, pedestal=pedestal,
         first_pixel=(600, 1600),
     )  # fmt: skip
-    measured = Systematics.read(measured.write(tmp_path / "systematics.fits"))
+    measured = DetectorPattern.read(measured.write(tmp_path / "pattern.fits"))
     assert measured.pedestal == pedestal
     exact, none, low = (
-        star().refined(rolls(pedestal), systematics=replace(measured, pedestal=each))
+        star().refined(rolls(pedestal), pattern=replace(measured, pedestal=each))
         for each in (pedestal, 0.0, 0.6 * pedestal)
     )
     assert exact.reduced_chi2 == pytest.approx(1.0, abs=0.1)
@@ -300,13 +302,13 @@ def test_the_pedestal_makes_the_pattern_equally_strong_everywhere():
     fit = fit_of(star, error, pedestal, 10)
     frames = fit.frames
     assert measure.pattern_pedestal([fit]) == pytest.approx(pedestal, rel=0.15)
-    known = measure.learn_systematics([fit])
+    known = measure.learn_pattern([fit])
     assert known.pedestal == measure.pattern_pedestal([fit])
     # Two frames: 0.05 / sqrt(2) of noise over the light.
     predicted = noise / np.sqrt(2) / (star + known.pedestal)
-    pull = (known.pattern - error) / predicted
+    pull = (known.value - error) / predicted
     assert 0.5 < pull.std() < 1.05
-    assert np.corrcoef(known.pattern.ravel(), error.ravel())[0, 1] > 0.85
+    assert np.corrcoef(known.value.ravel(), error.ravel())[0, 1] > 0.85
     elsewhere = replace(frames[1].observation, first_pixel=None)
     lost = SimpleNamespace(**{**vars(frames[1]), "observation": elsewhere})
     apart = SimpleNamespace(**{**vars(fit), "frames": (frames[0], lost)})
@@ -332,7 +334,7 @@ def test_a_pattern_is_not_shrunk_by_errors_that_are_too_large():
     far = star < 1
     for stated in (0.05, 0.08):
         fits = [fit_of(star, error, 1.5, 20, stated), fit_of(star / 3, error, 1.5, 21, stated)]
-        pattern = measure.learn_systematics(fits).pattern
+        pattern = measure.learn_pattern(fits).value
         # The slope of the truth against the pattern is 1 if it is shrunk as it should be.
         slope = (error * pattern)[far].sum() / (pattern**2)[far].sum()
         assert slope == pytest.approx(1.0, abs=0.05)

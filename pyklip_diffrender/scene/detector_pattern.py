@@ -1,4 +1,4 @@
-"""The known error of the star model, pixel by pixel: the flat-field pattern."""
+"""The detector pattern: the known error of the star model, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ _PROVENANCE = ("stars", "frames", "dates")
 
 
 def pattern_hdus(
-    pattern: NDArray[np.floating], error: NDArray[np.floating], source: Any, version: int = 1
+    value: NDArray[np.floating], error: NDArray[np.floating], source: Any, version: int = 1
 ) -> list[fits.ImageHDU]:
     """Return the FITS extensions PATTERN and PATTERN_ERROR of one of the patterns of a file.
 
-    `pattern` and `error` are (ny, nx), NaN errors where nothing was measured; `source` has the
-    attributes of `Systematics` that go into the header; `version` is the pattern's number in the
-    file.
+    `value` and `error` are (ny, nx), NaN errors where nothing was measured; `source` has the
+    attributes of `DetectorPattern` that go into the header; `version` is the pattern's number in
+    the file.
     """
     hdus = [
-        fits.ImageHDU(pattern, name="PATTERN", ver=version),
+        fits.ImageHDU(value, name="PATTERN", ver=version),
         fits.ImageHDU(error, name="PATTERN_ERROR", ver=version),
     ]
     header = hdus[0].header
@@ -53,10 +53,10 @@ def pattern_hdus(
 
 
 def pattern_fields(hdus: fits.HDUList, version: int = 1) -> dict[str, Any]:
-    """Return pattern, error and the other attributes that `pattern_hdus` wrote."""
+    """Return value, error and the other attributes that `pattern_hdus` wrote."""
     header = hdus["PATTERN", version].header
     return {
-        "pattern": native_float64(hdus["PATTERN", version].data),
+        "value": native_float64(hdus["PATTERN", version].data),
         "error": native_float64(hdus["PATTERN_ERROR", version].data),
         "center": (float(header["STARX"]), float(header["STARY"])),
         "pedestal": float(header["PEDESTAL"]),
@@ -140,67 +140,67 @@ def unrecorded(learned: Any, observation: Observation) -> list[str]:
     return missing
 
 
-def caveat(systematics: Systematics, observation: Observation) -> str:
+def caveat(pattern: DetectorPattern, observation: Observation) -> str:
     """Reasons against relying on a pattern that is used; empty if there are none.
 
     Only patterns with values have reasons: where the size alone is known, it is the frames' own.
     """
-    if not systematics.pattern.any():
+    if not pattern.value.any():
         return ""
-    remarks, missing = [], unrecorded(systematics, observation)
+    remarks, missing = [], unrecorded(pattern, observation)
     if missing:
         remarks.append(
             f"not compared, because pattern or frames do not say it: {', '.join(missing)}"
         )
-    covered = systematics.covered(observation)
+    covered = pattern.covered(observation)
     if covered < HALF_COVERED:
         remarks.append(f"covers {100 * covered:.0f} % of the pixels")
     return "; ".join(remarks)
 
 
-def require_pattern_of(systematics: Systematics, observation: Observation) -> None:
+def require_pattern_of(pattern: DetectorPattern, observation: Observation) -> None:
     """Raise IncompatibleSetupError for a pattern that an observation's pixels cannot have.
 
     A pattern is refused for another filter, mask or detector, if it covers no pixel, and if it was
     learned from the star of the observation.
     """
-    name = f"systematics: the pattern {systematics.name!r}"
-    differing = contradiction(systematics, observation)
+    name = f"pattern {pattern.name!r}"
+    differing = contradiction(pattern, observation)
     if differing is not None:
         aspect, before, now = differing
         raise IncompatibleSetupError(
             f"{name} was learned with the {aspect} {before}, and {observation.name} has the "
             f"{aspect} {now}. Give a pattern of the same {aspect}, or 'auto'"
         )
-    if shows_star(systematics, observation):
+    if shows_star(pattern, observation):
         raise IncompatibleSetupError(
             f"{name} was learned from frames of {observation.target}, the star of "
             f"{observation.name}: its planets are part of the pattern, and would be subtracted "
             "with it. Give a pattern of other stars, or 'auto'"
         )
-    if systematics.covered(observation) == 0:
-        (ny, nx), (rows, columns) = observation.shape, systematics.pattern.shape
+    if pattern.covered(observation) == 0:
+        (ny, nx), (rows, columns) = observation.shape, pattern.value.shape
         raise IncompatibleSetupError(
             f"{name} has none of the pixels of {observation.name}: it has {columns} x {rows} from "
-            f"{systematics.first_pixel} on (column and row on the detector), the frame {nx} x {ny} "
+            f"{pattern.first_pixel} on (column and row on the detector), the frame {nx} x {ny} "
             f"from {observation.first_pixel} on. Give a pattern of the same subarray, or 'auto'"
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Systematics:
+class DetectorPattern:
     """A multiplicative pattern that the star model misses, with its uncertainty.
 
     The part of a star's image that no wavefront explains is, on the same pixels of the detector,
     largely the same fraction of the light of every star: mostly an error of the flat field.
     The star in pixel p is taken to be ``model_p * (1 + m_p) + pedestal * m_p``, where m_p is
-    Gaussian with mean `pattern` and standard deviation `error`. Frames of the same pixels that are
+    Gaussian with mean `value` and standard deviation `error`. Frames of the same pixels that are
     fitted together share m_p. Light of companions is not multiplied: nothing of it can be mistaken
     for the pattern.
 
     Attributes
     ----------
-    pattern : ndarray, (ny, nx)
+    value : ndarray, (ny, nx)
         Residual over star.
     error : ndarray, (ny, nx)
         Standard deviation of the pattern.
@@ -232,11 +232,11 @@ class Systematics:
     >>> import numpy as np
     >>> import pyklip_diffrender as dr
     >>> flat = np.full((8, 8), 0.002)
-    >>> dr.Systematics(flat, flat / 4, center=(3.5, 3.5), unknown=0.005, name="flat field")
-    <Systematics 'flat field': None, 8 x 8 pixels>
+    >>> dr.DetectorPattern(flat, flat / 4, center=(3.5, 3.5), unknown=0.005, name="flat field")
+    <DetectorPattern 'flat field': None, 8 x 8 pixels>
     """
 
-    pattern: NDArray[np.float64]
+    value: NDArray[np.float64]
     error: NDArray[np.float64]
     center: tuple[float, float]
     unknown: float
@@ -244,22 +244,22 @@ class Systematics:
     first_pixel: tuple[int, int] | None = None
     filter: str | None = None
     image_mask: str | None = None
-    name: str = "systematics"
+    name: str = "pattern"
     provenance: dict[str, Any] = field(default_factory=dict)
     detector: str | None = None
     flat: str | None = None
     catalogue: tuple[CatalogueStar, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.pattern.ndim != 2 or self.pattern.shape != self.error.shape:
+        if self.value.ndim != 2 or self.value.shape != self.error.shape:
             raise ShapeError(
-                f"pattern and error: got shapes {self.pattern.shape} and {self.error.shape}, "
+                f"value and error: got shapes {self.value.shape} and {self.error.shape}, "
                 "expected two equal shapes (ny, nx)"
             )
 
     def __repr__(self) -> str:
-        ny, nx = self.pattern.shape
-        return f"<Systematics {self.name!r}: {self.filter}, {nx} x {ny} pixels>"
+        ny, nx = self.value.shape
+        return f"<DetectorPattern {self.name!r}: {self.filter}, {nx} x {ny} pixels>"
 
     @property
     def stars(self) -> tuple[CatalogueStar, ...]:
@@ -275,7 +275,7 @@ class Systematics:
 
     def to_hdus(self) -> list[Any]:
         """Return the FITS extensions PATTERN and PATTERN_ERROR."""
-        hdus = pattern_hdus(self.pattern, self.error, self)
+        hdus = pattern_hdus(self.value, self.error, self)
         header = hdus[0].header
         header["LABEL"] = fits_text(self.name)
         header["UNKNOWN"] = (self.unknown, "deviation where nothing was measured")
@@ -286,8 +286,8 @@ class Systematics:
         return hdus
 
     @classmethod
-    def from_hdus(cls, hdus: fits.HDUList) -> Systematics:
-        """Make the systematics from what `to_hdus` returned."""
+    def from_hdus(cls, hdus: fits.HDUList) -> DetectorPattern:
+        """Make the pattern from what `to_hdus` returned."""
         header = hdus["PATTERN"].header
         return cls(
             **pattern_fields(hdus),
@@ -302,9 +302,9 @@ class Systematics:
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write to a FITS file, atomically.
 
-        PATTERN is residual over star, PATTERN_ERROR its standard deviation. The header of PATTERN
-        has STARX and STARY (position of the star, 0-indexed), COLUMN and ROW (first pixel on the
-        detector), PEDESTAL, FILTER, CORONMSK, DETECTOR, R_FLAT, and the stars.
+        PATTERN is the residual over the star, PATTERN_ERROR its standard deviation. The header of
+        PATTERN has STARX and STARY (position of the star, 0-indexed), COLUMN and ROW (first pixel
+        on the detector), PEDESTAL, FILTER, CORONMSK, DETECTOR, R_FLAT, and the stars.
 
         Parameters
         ----------
@@ -322,7 +322,7 @@ class Systematics:
         return Path(path)
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Systematics:
+    def read(cls, path: str | os.PathLike[str]) -> DetectorPattern:
         """Read what `write` wrote.
 
         Raises
@@ -335,8 +335,8 @@ class Systematics:
                 return cls.from_hdus(hdus)
             except (KeyError, TypeError, ValueError) as error:
                 raise CorruptFileError(
-                    f"{Path(path).name}: not a complete systematics file ({error}); expected one "
-                    "written by Systematics.write"
+                    f"{Path(path).name}: not a complete detector pattern ({error}); expected a "
+                    "file written by DetectorPattern.write"
                 ) from error
 
     def _box(self, observation: Observation) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -349,7 +349,7 @@ class Systematics:
             x, y = np.subtract(self.first_pixel, observation.first_pixel)
         else:
             x, y = np.round(observation.center[0] - self.center).astype(int)
-        (ny, nx), (height, width) = observation.shape, self.pattern.shape
+        (ny, nx), (height, width) = observation.shape, self.value.shape
         # Overlap of the pattern, moved by (x, y), with the observation's array.
         first_row, first_column = max(y, 0), max(x, 0)
         rows = slice(first_row, max(min(y + height, ny), first_row))
@@ -362,7 +362,7 @@ class Systematics:
 
     def covered(self, observation: Observation) -> float:
         """The part of the pixels of an observation that the pattern has."""
-        return self.pattern[self._box(observation)[1]].size / np.prod(observation.shape)
+        return self.value[self._box(observation)[1]].size / np.prod(observation.shape)
 
     def at(self, observation: Observation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pattern and its error on the pixels of an observation.
@@ -372,12 +372,12 @@ class Systematics:
 
         Returns
         -------
-        pattern, error : ndarray, (ny, nx)
-            Where nothing was measured the pattern is 0 and its error `unknown`.
+        value, error : ndarray, (ny, nx)
+            Where nothing was measured the value is 0 and its error `unknown`.
         """
-        pattern = np.zeros(observation.shape)
+        value = np.zeros(observation.shape)
         error = np.full(observation.shape, self.unknown)
         there, own = self._box(observation)
-        pattern[there] = self.pattern[own]
+        value[there] = self.value[own]
         error[there] = self.error[own]
-        return pattern, error
+        return value, error
