@@ -195,8 +195,8 @@ def _rules_of_a_fit() -> list[Breakage]:
         ),
         Breakage(
             "rule-finer", "a rough fit that does not explain its data goes on",
-            "is_rough = settings.tolerance > _FINER_TOLERANCE and fit.status is Status.MODEL_MISMATCH",
-            "is_rough = False", "detection",
+            "settings.tolerance > _FINER_TOLERANCE and fit.status is Status.MODEL_MISMATCH",
+            "False", "detection",
         ),
         Breakage(
             "rule-old-map", "the prior is wider for an old map",
