@@ -12,6 +12,7 @@ from small_files import calints
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pattern import MeasuredPattern, combine_patterns, place_on_detector
+from pyklip_diffrender.scene.aligned_frames import shift_frames, undo_shifts
 from pyklip_diffrender.scene.star_place import measured_offset
 
 SIDE = 320
@@ -237,3 +238,19 @@ def test_a_star_is_measured_to_a_tenth_of_a_pixel(x):
     star = 1e3 * np.exp(-((distance / 4) ** 2)) * (1 + 0.5 * np.cos(distance))
     away = measured_offset(star, np.ones_like(star), star > -1, stated, 0.063)
     assert away == pytest.approx([x, 0.0], abs=0.1)
+
+
+def test_padding_around_shifted_frames_leaves_their_pixels_valid():
+    """Rows and columns of NaN that were added after the shift are no gaps of the image."""
+    smooth = gaussian_filter(np.random.default_rng(1).normal(size=(1, 40, 48)), (0, 1.2, 1.2))
+    shift = np.array([[0.3, -0.2]])
+    moved, error = shift_frames(100 * smooth, shift), np.ones(smooth.shape)
+    around = ((0, 0), (7, 12), (20, 5))
+    padded, errors = (np.pad(each, around, constant_values=np.nan) for each in (moved, error))
+    inner = np.s_[:, 7:47, 20:68]
+    for found, plain in zip(
+        undo_shifts(padded, errors, -shift), undo_shifts(moved, error, -shift), strict=True
+    ):
+        np.testing.assert_array_equal(found[inner], plain)
+    valid = undo_shifts(padded, errors, -shift)[2]
+    assert valid.sum() == valid[inner].sum() == smooth.size

@@ -179,6 +179,16 @@ def undo_shifts(
     (frames, 2). The result has the frames, their errors, and the valid pixels, which are no gaps
     and do not depend on any.
     """
+    # Rows and columns without any data were added to the image, and do not limit how well it is
+    # known at its edge.
+    rows, columns = (np.flatnonzero(np.isfinite(data).any(axis=axes)) for axes in ((0, 2), (0, 1)))
+    if len(rows) and data.shape[1:] != (np.ptp(rows) + 1, np.ptp(columns) + 1):
+        window = np.s_[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        parts = undo_shifts(data[window], error[window], shifts)
+        whole = np.zeros_like(data), np.ones_like(data), np.zeros(data.shape, dtype=bool)
+        for array, part in zip(whole, parts, strict=True):
+            array[window] = part
+        return whole
     # A Fourier shift makes every pixel depend on all pixels of its row and column. Gaps are filled
     # from their neighbours before it; how wrong that may be is added to the variance of the pixels
     # that depend on it, and pixels where it would be more than a quarter of the variance are
