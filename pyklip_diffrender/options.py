@@ -185,11 +185,11 @@ class SharedOptions:
         "stated_type": 'DetectorPattern, PatternLibrary, path, "auto", "references" or "off"',
         "meaning": """Detector pattern, or a file with one (``pattern.fits``); or a library of
             patterns to search besides the package's, its file, or a folder of such files. "auto"
-            takes the pattern of the package's library (see `known_pattern`), and fits the
-            reference stars only where there is none for these pixels; "references" fits them in any
-            case and uses both. A fit that shows less than half of a library's pattern is repeated
-            without libraries. If neither has the pattern, rolls on the same pixels are assumed to
-            have one of the usual strength in common. With "off" there is no pattern.""",
+            takes the pattern of the package's library (see `known_pattern`), and learns it from
+            reference stars where the library has none for these pixels; "references" learns it from
+            them in any case and uses both. A fit that shows less than half of a library's pattern
+            is repeated without libraries. If neither has the pattern, rolls on the same pixels are
+            assumed to have one of the usual strength in common. With "off" there is no pattern.""",
         "expected": "'auto', 'references', 'off', or an existing file or folder with patterns",
         "help": """Detector pattern: auto (the package's library, else the reference stars),
             references (both), off, a folder or file of patterns to search besides the package's
@@ -199,10 +199,11 @@ class SharedOptions:
     references: References = field(default="joint", metadata={
         "choices": get_args(References),
         "meaning": """Use of the frames of reference stars. With "joint" frames of the target's
-            epoch are fitted together with the target's, in one likelihood, if that makes the limits
-            deeper, and frames of other epochs teach the detector pattern where the library has
-            none; with "pattern" all of them do; with "off" they are not used. With `disk`, "joint"
-            stands for "pattern".""",
+            epoch are fitted together with the target's, in one likelihood, where that makes the
+            limits deeper, and frames of other epochs teach the detector pattern where the library
+            has none; with "pattern" all of them do; with "off" they are for KLIP only. With `disk`,
+            "joint" stands for "pattern". The guide "Detector pattern and reference stars" says what
+            each frame is used for.""",
         "help": """Use of the frames of reference stars: in one likelihood with the target's, for
             the detector pattern, or not at all.""",
     })  # fmt: skip

@@ -73,9 +73,9 @@ class DiffrenderSettings:
         Unit of the frames. Read from BUNIT if present, else dimensionless.
     pattern : DetectorPattern, PatternLibrary, path, "auto", "references" or "off", optional
         Detector pattern. "auto", the default for real NIRCam frames, takes the pattern of the
-        package's library, and fits the reference frames only where it has none; "references" fits
-        them in any case and uses both; a library, its file, or a folder of such files is searched
-        besides the package's; see `reduce`. Reference frames come from a psf_library that
+        package's library, and learns it from the reference frames where it has none; "references"
+        learns it from them in any case and uses both; a library, its file, or a folder of such
+        files is searched besides the package's; see `reduce`. Reference frames come from a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.
     keep_detected : bool, optional
         Subtract none of the light of detected companions with the star; True by default for real

@@ -251,9 +251,9 @@ def reduce(
 ) -> Reduction:
     """Search a sequence of real frames for planets.
 
-    The detector pattern, the error of the model on the detector's pixels, comes from the
-    package's library or, where that has none, from fits of the sequence's reference stars. With
-    it, all frames of the target are fitted together and searched.
+    All frames of the target are fitted together, with the error of the model on the detector's
+    pixels (the detector pattern), and searched. The guide "Detector pattern and reference stars"
+    says what frames of reference stars are used for.
 
     Parameters
     ----------

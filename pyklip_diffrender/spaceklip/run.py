@@ -71,9 +71,9 @@ def run_obs(
 ) -> dict[str, Detection]:
     """Subtract the star from every concatenation of a spaceKLIP database, and search for planets.
 
-    All rolls of a concatenation are fitted together. References (TYPE is REF) are used only where
-    the library has no detector pattern for the pixels, or with ``pattern="references"``; none
-    are needed. The products are added to ``database.red`` and the candidates to ``database.src``.
+    All rolls of a concatenation are fitted together. References (TYPE is REF) are used as
+    `reduce` uses frames of reference stars, see its option `references`; none are needed. The
+    products are added to ``database.red`` and the candidates to ``database.src``.
     Every file is judged before the first fit as `pyklip_diffrender.ExposureSequence.from_files`
     judges it.
 
