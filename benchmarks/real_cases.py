@@ -33,9 +33,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from astropy import units as u
 from astropy.table import Table, vstack
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.io.files import write_table
 from pyklip_diffrender.pattern import choice as patterns
 from pyklip_diffrender.reduction import summarise
 from pyklip_diffrender.reduction.klip import klip_curve, small_sample_factor
@@ -52,6 +54,8 @@ FILTERS = ("F444W", "F356W")
 Case = tuple[str, str, str, str, str]
 """Star; filter; rolls ("pair", "roll 1", "roll 2"); the package's library of patterns ("library" or
 "no library"); frames of other stars ("references" or "no references")."""
+
+GIVEN = ("star", "filter", "library", "references")
 
 FORMS = (
     ("no library", "references"),
@@ -206,6 +210,40 @@ def print_tables(rows: list[dict[str, Any]]) -> None:
         vstack(parts).pprint_all()
 
 
+def limits_of_pairs(rows: list[dict[str, Any]]) -> Table:
+    """One row for each separation of every pair, with what both methods were given."""
+    parts = []
+    for row in sorted(rows, key=lambda row: [row[name] for name in GIVEN]):
+        if "KLIP" not in row:
+            continue
+        part = Table({name: [row[name]] * len(SEPARATIONS) for name in GIVEN})
+        part["separation"] = SEPARATIONS * u.arcsec
+        for name, key in (("limit", "contrast"), ("klip", "KLIP"), ("known_star", "known_star")):
+            part[name] = row[key]
+        corrected = np.divide(row["KLIP small sample"], row["small_sample"])
+        part["ratio"], part["ratio_small_sample"] = part["klip"] / part["limit"], corrected
+        part["error_factor"] = row["error_factor"]
+        parts.append(part)
+    table = vstack(parts)
+    about = {
+        "library": "the package's patterns of other stars, or none",
+        "references": "frames of other stars that both methods were given",
+        "limit": "5-sigma contrast, median over the ring",
+        "klip": "KLIP's limit, best of 1 to 5 modes, with the other roll and the references",
+        "known_star": "limit for a known star, without error factor",
+        "ratio": "KLIP / this package",
+        "ratio_small_sample": "the same, each with its small-sample correction",
+        "error_factor": "factor by which errors are multiplied",
+    }
+    for name, text in about.items():
+        table[name].description = text
+    for name in ("limit", "klip", "known_star"):
+        table[name].format = ".2e"
+    for name in ("ratio", "ratio_small_sample", "error_factor"):
+        table[name].format = ".2f"
+    return table
+
+
 def main() -> None:
     """Reduce all cases in processes of their own and print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -217,6 +255,7 @@ def main() -> None:
     )
     parser.add_argument("--opd", help="map to start from; flat for none")
     parser.add_argument("--tables", action="store_true", help="only print those of earlier runs")
+    parser.add_argument("--limits", type=Path, help="file for the limits of pairs of rolls (ECSV)")
     options = parser.parse_args()
     chosen = [tuple(options.case)] if options.case else cases()
     for case in [] if options.tables else chosen:
@@ -232,7 +271,10 @@ def main() -> None:
             command = [sys.executable, "-m", "benchmarks.real_cases", *rest, *number]
             subprocess.run([*command, "--case", *case], check=False)
     if not options.case:
-        print_tables([json.loads(path.read_text()) for path in options.output.glob("*/row.json")])
+        rows = [json.loads(path.read_text()) for path in options.output.glob("*/row.json")]
+        print_tables(rows)
+        if options.limits is not None:
+            write_table(limits_of_pairs(rows), options.limits)
 
 
 if __name__ == "__main__":

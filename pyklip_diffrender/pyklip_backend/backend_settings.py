@@ -75,8 +75,8 @@ class DiffrenderSettings:
         Detector pattern. "auto", the default for real NIRCam frames, takes the pattern of the
         package's library, and learns it from the reference frames where it has none; "references"
         learns it from them in any case and uses both; a library, its file, or a folder of such
-        files is searched besides the package's; see `reduce`. Reference frames come from a psf_library that
-        `JWSTData` has read, if the mode contains RDI, and any in the dataset.
+        files is searched besides the package's; see `reduce`. Reference frames come from a
+        psf_library that `JWSTData` has read, if the mode contains RDI, and any in the dataset.
     keep_detected : bool, optional
         Subtract none of the light of detected companions with the star; True by default for real
         NIRCam frames, else False. Bright ones are part of the fit in any case, as in `reduce`.
