@@ -22,6 +22,7 @@ without corrections; the limit of a known star is that of Godoy et al. (2024, ar
 from __future__ import annotations
 
 import argparse
+import datetime
 import json
 import resource
 import subprocess
@@ -219,12 +220,17 @@ def limits_of_pairs(rows: list[dict[str, Any]]) -> Table:
         part = Table({name: [row[name]] * len(SEPARATIONS) for name in GIVEN})
         part["separation"] = SEPARATIONS * u.arcsec
         for name, key in (("limit", "contrast"), ("klip", "KLIP"), ("known_star", "known_star")):
-            part[name] = row[key]
+            part[name] = [float(f"{each:.4e}") for each in row[key]]
         corrected = np.divide(row["KLIP small sample"], row["small_sample"])
-        part["ratio"], part["ratio_small_sample"] = part["klip"] / part["limit"], corrected
-        part["error_factor"] = row["error_factor"]
+        part["ratio"] = np.round(np.divide(row["KLIP"], row["contrast"]), 3)
+        part["ratio_small_sample"] = np.round(corrected, 3)
+        part["error_factor"] = np.round(row["error_factor"], 3)
         parts.append(part)
     table = vstack(parts)
+    table.meta = {
+        "command": "python -m benchmarks.real_cases --output FOLDER --planets 0 --limits FILE",
+        "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
+    }
     about = {
         "library": "the package's patterns of other stars, or none",
         "references": "frames of other stars that both methods were given",

@@ -208,6 +208,21 @@ def _cheapest(cases: dict[str, float], kind: str, finest: str) -> str:
     return best
 
 
+def like_with_like() -> list[list[str]]:
+    """KLIP's limits over this package's for pairs of real rolls, by what both were given."""
+    table = Table.read(RESULTS / "like_with_like.ecsv")
+    separations = sorted(set(table["separation"].value.tolist()))
+    rows = [["star, filter", "library, references", *(f'{each:g}"' for each in separations)]]
+    for case in table.group_by(["library", "references", "star", "filter"]).groups:
+        first = case[0]
+        given = f"{first['library']}, {first['references']}"
+        ratios = [f"{each:.2f}" for each in case["ratio"]]
+        rows.append([f"{first['star']}, {first['filter']}", given, *ratios])
+    # Without the library first, with references before without.
+    head, *rest = rows
+    return [head, *sorted(rest, key=lambda row: ("no lib" not in row[1], "no ref" in row[1]))]
+
+
 def hard_cases() -> Table:
     """Hard cases with the error of the fitted star and the status of the fit."""
     table = Table.read(RESULTS / "stability_fits.ecsv")
@@ -225,3 +240,4 @@ def write_tables(folder: Path) -> None:
     _write(folder / "situations.csv", situations())
     _write(folder / "keywords.csv", keywords())
     _write(folder / "scene_needs.csv", scene_needs())
+    _write(folder / "like_with_like.csv", like_with_like())

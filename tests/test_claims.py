@@ -137,6 +137,7 @@ def speeds(row, ours, others, error, scale=1.0, others_scale=1.0):
 
 
 BOTH = ("F444W", "F356W")
+LIKE, SAME = "like_with_like", {"library": "no library", "references": "references"}
 LIMITS, IMAGES, DISKS = "real_pairs_limits", "real_pairs_images", "disk_limits"
 README, PAPER, PAGE = "README.md", "paper/paper.md", "docs/validation/real_frames.md"
 HOWTO, RESOURCES = "docs/howto/real_frames.md", "docs/howto/resources.md"
@@ -161,13 +162,14 @@ def claims():
                for band in BOTH]  # fmt: skip
     demo = [1e6 * stated("demo: contrast"), 1e6 * stated("demo: contrast", "error")]
     snr = stated("S/N of the companion")
+    like_with_like = [middle(LIKE, "ratio", star=star, filter=band, **SAME)
+                      for star in ("G-7-34", "HIP17695") for band in BOTH]  # fmt: skip
     scatter = np.prod([table("visits_null")[name] for name in ("scatter", "factor")], axis=0)
     pulls = table("visit_planets")
     visits = table("reference_sequences").group_by("visit").groups.aggregate(np.median)
     return (
-        (README, "and AU Mic's | {:.2f} | within 0.7 arcsec, up to {:.1f} times |",
-         [middle(LIMITS, "ratio", star="G 7-34", filter="F444W"),
-          1 / least(LIMITS, "ratio", star="G 7-34", filter="F444W")]),
+        (README, "| the same | {:.1f} to {:.1f} | once, within 0.7 arcsec, up to {:.1f} times |",
+         [f(like_with_like) for f in (min, max)] + [1 / least(LIKE, "ratio", **SAME)]),
         (README, "| all | all | {:.2f} | at some separations, up to {:.1f} times |",
          [np.median(visits["klip_over_ours_raw"]),
           1 / least("reference_sequences", "klip_over_ours_raw")]),
@@ -220,9 +222,6 @@ def claims():
          [f(table(LIMITS)["error_factor"]) for f in (min, max)]),
         (PAGE, "for one of them {:.1f} times",
          [stated("star's flux from a flat wavefront over that from a map, largest")]),
-        (PAGE, "F444W are {:.1f} to {:.1f} times higher.",
-         [stated(f"limits without a pattern over those with it, {each}")
-          for each in ("smallest", "largest")]),
         (PAGE, "Of {1:.0f} planets, {0:.0f} are detected:", [found, injected]),
         (PAGE, "{:.0f} of {:.0f} beyond 0.45 arcsec, and {:.0f} of {:.0f} within",
          [*beyond, *within]),
