@@ -78,7 +78,7 @@ def combine(
     reductions : sequence of Reduction, Detection or path
         A path is a folder with the products of a reduction, whose ``detection.fits`` is
         read. A fit that does not explain its data takes part if its errors were scaled to the
-        scatter of the S/N, as they are in real frames; `Combination.remarks` names it. A reduction
+        scatter of the S/N, as they are in real frames; ``Combination.remarks`` names it. A reduction
         whose frames another one has is left out.
     spectra : str, path, or sequence of them
         "blackbody" (150 to 1,500 K), "flat" (the same flux density per frequency in all filters),
