@@ -78,8 +78,8 @@ def combine(
     reductions : sequence of Reduction, Detection or path
         A path is a folder with the products of a reduction, whose ``detection.fits`` is
         read. A fit that does not explain its data takes part if its errors were scaled to the
-        scatter of the S/N, as they are in real frames; ``Combination.remarks`` names it. A reduction
-        whose frames another one has is left out.
+        scatter of the S/N, as they are in real frames; ``Combination.remarks`` names it. A
+        reduction whose frames another one has is left out.
     spectra : str, path, or sequence of them
         "blackbody" (150 to 1,500 K), "flat" (the same flux density per frequency in all filters),
         the file of a table of spectra (see `planet_spectra`), and "free": any fluxes that are
