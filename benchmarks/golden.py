@@ -104,7 +104,7 @@ def numbers_of_table(table: QTable) -> Numbers:
         values[f"place {k}: north"] = float(row["delta_dec"].value)
         values[f"snr {k}"] = float(row["snr"])
         for name in table.colnames:
-            if name.startswith("contrast") and "error" not in name:
+            if name.startswith("contrast") and not name.endswith(("_error", "_corr")):
                 values[f"flux {k}: {name}"] = float(row[name])
     return values
 
