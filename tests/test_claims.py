@@ -174,7 +174,8 @@ def claims():
          [np.median(visits["klip_over_ours_raw"]),
           1 / least("reference_sequences", "klip_over_ours_raw")]),
         (README, "ours keeps {:.0f} %, KLIP at most {:.0f} %", [min(joint), klip[1]]),
-        (README, "by {:.1f} to {:.1f}.", [f(f(table(name)["error_factor"]) for name in (LIMITS, LIKE)) for f in (min, max)]),
+        (README, "by {:.1f} to {:.1f}.",
+         [f(f(table(name)["error_factor"]) for name in (LIMITS, LIKE)) for f in (min, max)]),
         (README, "up to {:.1f} times too bright",
          [stated("star's flux from a flat wavefront over that from a map, largest")]),
         # -- intake and resources
