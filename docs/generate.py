@@ -93,12 +93,11 @@ SITUATIONS = (
         f"Limits [beside KLIP's]({_DATA}), and KLIP's curve in the report.",
     ),
     Situation(
-        "a reference star, one frame", "Where the library has the pattern, the frame is for KLIP "
-        "only; elsewhere it joins the wavefront, if that makes limits deeper.", {}, "",
-        "Nothing of it with the library. Ask for dithers when you propose.",
+        "a reference star, one frame", "It joins the wavefront where that makes limits deeper.",
+        {}, "", "Little of it with the library. Ask for dithers when you propose.",
     ),
     Situation(
-        "a reference star, dithered", "All frames in one likelihood, if that makes limits deeper.",
+        "a reference star, dithered", "All frames in one likelihood, where limits are deeper.",
         {}, "",
         "[Deeper limits](../validation/references.md) in about twice the time of the rolls alone.",
     ),
