@@ -10,9 +10,11 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import deeper, stated_limits
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import separation_of
+from pyklip_diffrender.reduction import visit
+from pyklip_diffrender.refinement import Status
 
 PLANETS = (dr.Planet(4e-5, 0.45, 30.0), dr.Planet(2e-5, 0.8, 200.0))
-EDGE = 0.6
+EDGE = 0.65
 
 
 @cache
@@ -125,3 +127,19 @@ def test_the_joined_search_is_read_as_it_was_written(tmp_path):
     searches()[0].write(tmp_path, overwrite=True)
     assert dr.Detection.read(tmp_path).other is None
     assert not (tmp_path / "detection_other.fits").exists()
+
+
+def test_the_fit_that_is_deeper_at_most_separations_is_kept_and_the_others_are_named():
+    alone, together = pair()
+    fits = alone.fits[0], together.fits[0]
+    kept, detection, gain, where = visit._kept(*fits, alone, together)
+    separations, limits = stated_limits(alone)
+    gains = limits / stated_limits(together)[1]
+    assert kept is fits[int(np.median(gains) > 1)] is detection.fits[0]
+    assert gain == pytest.approx(np.median(gains[separations > EDGE]))
+    assert where == f"at 0.7 to {separations[-1]:.1f} arcsec"
+    # A fit of all frames whose errors are not calibrated is no gain over one whose are.
+    failed = replace(fits[1], status=Status.MODEL_MISMATCH)
+    assert "MODEL_MISMATCH" in visit._kept(fits[0], failed, alone, together)
+    worse = with_factor(together, lambda r: np.full_like(r, 3.0))
+    assert "limits would be" in visit._kept(*fits, alone, worse)
