@@ -8,7 +8,6 @@ import contextlib
 import io
 import json
 from functools import cached_property
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -227,6 +226,7 @@ class Request(NamedTuple):
     # Options of `reduce` by name, the same for all frames.
     options: dict[str, Any]
     reference_star: bool = False
+    reference_epochs: tuple[str, ...] = ()  # Of the reference star, if not the target's.
     # "fitted", "flux" (a flux density in each filter) or "sed" (a file).
     star: str = "fitted"
     # "auto", "library" or "file" (one for each filter).
@@ -240,7 +240,8 @@ class Request(NamedTuple):
         return {
             name: [
                 path
-                for star, date in product(stars, self.epochs)
+                for star in stars
+                for date in (star == REFERENCE and self.reference_epochs) or self.epochs
                 for path in self.world.frames(name, date, star)
             ]
             for name in self.filters

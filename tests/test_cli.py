@@ -638,7 +638,7 @@ def test_doctor_reports_versions_data_machine_and_a_fit(monkeypatch, capsys):
     assert main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line[:6] for line in lines] == ["ok    "] * 5
-    words = (f", torch {version('torch')}, ", "patterns of", "stpsf", "processors", "self-test: ")
+    words = (f", torch {version('torch')}, ", "patterns", "stpsf", "processors", "self-test: ")
     assert all(word in line for word, line in zip(words, lines, strict=True))
     monkeypatch.setenv("STPSF_PATH", "/nowhere")
     monkeypatch.setattr(application, "CHECKS", (application.check_stpsf, application.check_data))

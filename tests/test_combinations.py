@@ -226,9 +226,11 @@ def expected(case, world, searches):
     for filter_ in case["filters"]:
         for date in case["epochs"]:
             plain = {**likelihood, "filters": (filter_,), "epochs": (date,)}
-            key = tuple(plain.items())
+            # Frames of the reference star teach the pattern at every epoch of the target.
+            request = request_of(plain, world)._replace(reference_epochs=case["epochs"])
+            key = (*plain.items(), case["epochs"] if case["reference_star"] else ())
             if key not in searches:
-                (searches[key],) = through_python(request_of(plain, world), None).searches
+                (searches[key],) = through_python(request, None).searches
                 assert_planet(searches[key])
             found[filter_, date] = searches[key]
     return found

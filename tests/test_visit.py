@@ -371,12 +371,13 @@ def test_references_of_other_epochs_teach_the_pattern_and_not_the_wavefront():
     near = reference(4)
     run, result = reduced([near, *far])
     assert [each.name for each in run._joining] == [near.name]
-    assert [each.use for each in result.visit.contributions] == ["not used", *["pattern"] * 3]
-    assert "only 1 frame of its star" in result.visit.contributions[0].reason
+    assert [each.use for each in result.visit.contributions] == ["wavefront", *["pattern"] * 3]
     assert "of another epoch" in result.visit.contributions[1].reason
-    assert [each.observation.name for each in result.fit.frames] == [e.name for e in science()]
-    assert result.reference_frames == 3
-    assert "3 for the detector pattern, 1 not used by the fit: only 1 frame" in str(result)
+    fitted = [each.observation.name for each in result.fit.frames]
+    assert fitted == [each.name for each in (*science(), near)]
+    assert result.reference_frames == 4
+    assert "of 4 reference frames 1 in the likelihood, limits " in str(result)
+    assert "3 for the detector pattern" in str(result)
     candidate_of(result.detection)
     # With a pattern of which only the size is known it is 1.4, although that is fitted.
     assert result.fit.chi2_per_pixel < 1.2 < alone()[1].chi2_per_pixel

@@ -254,7 +254,8 @@ frame.error[0, 1516:1836, 482:802] = sky.error[0]
 frame.data[0, 1660:1680, 1200:1220] = 1e6
 settings = dr.FitSettings.nircam("F444W", cycles=(6.0,), max_iterations=4)
 result = dr.reduce(dr.ExposureSequence("HD 1", (frame,)), opd, settings=settings, wide=True,
-size=40) row = result.wide.candidates[0]
+                   size=40)
+row = result.wide.candidates[0]
 # ru_maxrss would include the process of the tests, from which this one was made.
 peak = next(l.split()[1] for l in open("/proc/self/status") if l.startswith("VmHWM"))
 print(row["contrast"], row["x"].value, row["y"].value, peak)
