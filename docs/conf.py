@@ -67,6 +67,8 @@ myst_heading_anchors = 3
 _package = Path(pyklip_diffrender.__file__).parent
 _code = b"".join(path.read_bytes() for path in sorted(_package.rglob("*.py")))
 _cache = Path(__file__).parent / "_build" / "tutorials" / hashlib.sha256(_code).hexdigest()[:16]
+# Warnings of the machine that builds, such as a missing widget for progress bars.
+nb_output_stderr = "remove"
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(_cache)
 nb_execution_timeout = 600
