@@ -9,7 +9,7 @@ import pytest
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import deeper, stated_limits
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import separation_of
+from pyklip_diffrender.detection.field import separation_of, star_light
 from pyklip_diffrender.reduction import visit
 from pyklip_diffrender.refinement import Status
 
@@ -55,7 +55,7 @@ def pair():
 
 def fluxes(detection):
     """Flux of every candidate by separation, and its S/N."""
-    flux, table = detection.fits[0].frames[0].flux, detection.candidates
+    flux, table = star_light(detection.fits[0]), detection.candidates
     order = np.argsort(table["separation"])
     return flux * np.asarray(table["contrast"])[order], np.asarray(table["snr"])[order]
 
@@ -70,7 +70,7 @@ def test_limits_are_the_deeper_ones():
     magnitudes = joined.contrast_curve["delta_mag"].value
     np.testing.assert_allclose(10 ** (-0.4 * magnitudes), joined.contrast_curve["contrast"])
     # In units of flux, the map has the errors of the one or the other.
-    star = [each.fits[0].frames[0].flux for each in (first, second)]
+    star = [star_light(each.fits[0]) for each in (first, second)]
     away = separation_of(joined.grid)
     for part, search, unit in ((away < 0.5, first, star[0]), (away > 0.7, second, star[1])):
         expected = unit * search.error[part]
@@ -95,7 +95,7 @@ def test_measurements_are_those_of_the_deeper_search():
     first, second = pair()
     joined = deeper(first, second)
     places = [[0.3, 0.3], [-0.7, 0.4]]
-    star = [each.fits[0].frames[0].flux for each in (first, second)]
+    star = [star_light(each.fits[0]) for each in (first, second)]
     measured = joined.measure(places)
     for k, (search, unit) in enumerate(((first, star[0]), (second, star[1]))):
         row = search.measure(places)[k]

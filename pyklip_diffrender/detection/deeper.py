@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, is_within, separation_of
+from pyklip_diffrender.detection.field import Image, is_within, separation_of, star_light
 from pyklip_diffrender.detection.search_result import Detection
 
 _SAME_SOURCE_LAMBDA_D = 0.5
@@ -29,13 +29,10 @@ lambda/D at S/N 5."""
 
 
 def stated_limits(detection: Detection) -> tuple[Image, Image]:
-    """Separations, arcsec, and stated limits in units of flux.
-
-    Contrasts cannot be compared, because two fits may differ in the flux of the star.
-    """
+    """Separations, arcsec, and stated limits in units of light, see `star_light`."""
     curve = detection.contrast_curve
-    flux = detection.fits[0].frames[0].flux
-    return curve["separation"].to_value("arcsec"), flux * np.asarray(curve["contrast"])
+    light = star_light(detection.fits[0])
+    return curve["separation"].to_value("arcsec"), light * np.asarray(curve["contrast"])
 
 
 def deeper(first: Detection, second: Detection) -> Detection:
@@ -54,7 +51,7 @@ def deeper(first: Detection, second: Detection) -> Detection:
     # Between the separations of the curve, the nearest one decides.
     nearest = np.abs(separation_of(first.grid)[..., None] - separations).argmin(axis=-1)
     region = is_deeper[nearest]
-    scale = second.fits[0].frames[0].flux / first.fits[0].frames[0].flux
+    scale = star_light(second.fits[0]) / star_light(first.fits[0])
 
     def chosen(one: Image, other: Image) -> Image:
         return np.where(region, other, one)

@@ -15,7 +15,13 @@ from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Maps
 from pyklip_diffrender.detection.error_factor import Significance
-from pyklip_diffrender.detection.field import Image, curve_separations, far_from, is_within
+from pyklip_diffrender.detection.field import (
+    Image,
+    curve_separations,
+    far_from,
+    is_within,
+    star_light,
+)
 from pyklip_diffrender.detection.measurement import significance_of
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.templates import groups_of
@@ -395,7 +401,7 @@ class _Searched:
     residual: Image  # (ny, nx), the numerator of the maps.
     sources: Tensor  # (k, 2), x, y of the candidates from the star, arcsec.
     threshold: float
-    star: float  # Flux of the star in the fit.
+    star: float  # Light of the star in the fit, see `star_light`.
 
     @classmethod
     def of(cls, detection: Detection, inner: float, progress: bool) -> _Searched:
@@ -406,7 +412,7 @@ class _Searched:
             maps.without(known),
             known.offsets,
             detection.threshold,
-            detection.fits[0].frames[0].flux,
+            star_light(detection.fits[0]),
         )
 
     def finds(self, change: Image, place: Image) -> bool:

@@ -36,7 +36,14 @@ from pyklip_diffrender.detection.detection_file import (
     write_detection,
 )
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, Sky, is_within, pixels_of, places_of
+from pyklip_diffrender.detection.field import (
+    Image,
+    Sky,
+    is_within,
+    pixels_of,
+    places_of,
+    star_light,
+)
 from pyklip_diffrender.detection.measurement import (
     candidate_table,
     contrasts_at,
@@ -457,7 +464,7 @@ class Detection:
         places = np.stack([raw["x"].value, raw["y"].value], axis=1)
         theirs, errors = self.other._contrasts_at(places)
         # Relative to the star of this search, as the map is.
-        one, two = (each._searched[0][0].frames[0].flux for each in (self, self.other))
+        one, two = (star_light(each._searched[0][0]) for each in (self, self.other))
         chosen = is_within(self.of_other, self.grid, places)
         for name, unit in (("contrast", two / one), ("contrast_error", two / one), ("snr", 1.0)):
             raw[name] = np.where(chosen, unit * theirs[name], raw[name])
