@@ -5,11 +5,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import deeper, stated_limits
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import separation_of, star_light
+from pyklip_diffrender.detection.field import separation_of
 from pyklip_diffrender.reduction import visit
 from pyklip_diffrender.refinement import Status
 
@@ -55,7 +56,7 @@ def pair():
 
 def fluxes(detection):
     """Flux of every candidate by separation, and its S/N."""
-    flux, table = star_light(detection.fits[0]), detection.candidates
+    flux, table = detection.fits[0].frames[0].star_light, detection.candidates
     order = np.argsort(table["separation"])
     return flux * np.asarray(table["contrast"])[order], np.asarray(table["snr"])[order]
 
@@ -70,7 +71,7 @@ def test_limits_are_the_deeper_ones():
     magnitudes = joined.contrast_curve["delta_mag"].value
     np.testing.assert_allclose(10 ** (-0.4 * magnitudes), joined.contrast_curve["contrast"])
     # In units of flux, the map has the errors of the one or the other.
-    star = [star_light(each.fits[0]) for each in (first, second)]
+    star = [each.fits[0].frames[0].star_light for each in (first, second)]
     away = separation_of(joined.grid)
     for part, search, unit in ((away < 0.5, first, star[0]), (away > 0.7, second, star[1])):
         expected = unit * search.error[part]
@@ -95,7 +96,7 @@ def test_measurements_are_those_of_the_deeper_search():
     first, second = pair()
     joined = deeper(first, second)
     places = [[0.3, 0.3], [-0.7, 0.4]]
-    star = [star_light(each.fits[0]) for each in (first, second)]
+    star = [each.fits[0].frames[0].star_light for each in (first, second)]
     measured = joined.measure(places)
     for k, (search, unit) in enumerate(((first, star[0]), (second, star[1]))):
         row = search.measure(places)[k]
@@ -143,3 +144,63 @@ def test_the_fit_that_is_deeper_at_most_separations_is_kept_and_the_others_are_n
     assert "MODEL_MISMATCH" in visit._kept(fits[0], failed, alone, together)
     worse = with_factor(together, lambda r: np.full_like(r, 3.0))
     assert "limits would be" in visit._kept(*fits, alone, worse)
+
+
+def with_darker_stop(detection, loss):
+    """The same search, where the fit says that the Lyot stop lets less light of the star through.
+
+    An imaginary OPD a multiplies the amplitude by exp(-2 pi a / lambda). Sources of the same light
+    then have larger contrasts.
+    """
+    (fit,) = detection.fits
+    (frame,) = fit.frames
+    wavelength = fit.model.bandpass.mean_wavelength
+    imaginary = -np.log(1 - loss) * wavelength / (4 * np.pi)
+    darker = replace(frame, opd=frame.opd + 1j * imaginary)
+    assert darker.star_light == pytest.approx((1 - loss) * frame.star_light, rel=1e-9)
+    more, curve, own = 1 / (1 - loss), detection.contrast_curve.copy(), detection.sources
+    for name in ("contrast", "lowest", "highest", "small_sample", "known_star"):
+        curve[name] = more * curve[name]
+    units = np.repeat([more, 1.0, 1.0], len(own))
+    return replace(
+        detection,
+        fits=(replace(fit, frames=(darker,)),),
+        contrast=more * detection.contrast,
+        error=more * detection.error,
+        photon_error=more * detection.photon_error,
+        sources=replace(
+            own,
+            contrasts=more * own.contrasts,
+            covariance=own.covariance * torch.from_numpy(np.outer(units, units)),
+            detection_errors=more * own.detection_errors,
+        ),
+        contrast_curve=curve,
+    )
+
+
+def test_contrasts_are_related_by_the_light_behind_the_stop():
+    first, second = pair()
+    expected, joined = deeper(first, second), deeper(first, with_darker_stop(second, 0.1))
+    np.testing.assert_array_equal(joined.of_other, expected.of_other)
+    for name in ("contrast", "error", "photon_error"):
+        np.testing.assert_allclose(getattr(joined, name), getattr(expected, name), rtol=1e-9)
+    for name in ("contrast", "small_sample", "known_star", "delta_mag"):
+        curves = (each.contrast_curve[name] for each in (joined, expected))
+        np.testing.assert_allclose(*curves, rtol=1e-9)
+    np.testing.assert_allclose(joined.sources.contrasts, expected.sources.contrasts, rtol=1e-9)
+    np.testing.assert_allclose(joined.sources.covariance, expected.sources.covariance, rtol=1e-9)
+
+
+def test_factors_that_were_not_measured_are_read_as_they_were_written(tmp_path):
+    """Each search has one factor, and the joined one both."""
+    first, second = pair()
+    not_measured = [
+        replace(each, error_factor=ErrorFactor.constant(factor))
+        for each, factor in ((first, 1.1), (second, 1.3))
+    ]
+    joined = deeper(*not_measured)
+    joined.write(tmp_path)
+    again = dr.Detection.read(tmp_path)
+    assert not again.error_factor.is_measured
+    np.testing.assert_array_equal(again.error_factor.factors, joined.error_factor.factors)
+    assert set(np.unique(joined.error_factor.factors)) == {1.1, 1.3}

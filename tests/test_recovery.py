@@ -28,7 +28,7 @@ class Frame:
 
     def __init__(self, flux):
         blank = np.zeros((SIZE, SIZE))
-        self.flux = flux
+        self.flux = self.star_light = flux
         self.observation = dr.Observation.from_arrays(blank, blank + 1, pixelscale=PIXEL)
 
     def render(self, *, background, source):

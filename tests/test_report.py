@@ -136,7 +136,7 @@ def test_contributions_of_reference_frames_are_read_back():
         Contribution("a.fits", "HD 2", "wavefront", "", 1.2, 0.5, 3.0),
         Contribution("b.fits", "HD 3", "not used", "too faint"),
     )
-    visit = Visit(frames, 1.25)
+    visit = Visit(frames, 1.25, "at 0.2 to 0.5 arcsec")
     facts = summarise(replace(reduction(), visit=visit))["visit"]
     np.testing.assert_equal(asdict(Visit.from_facts(json.loads(json.dumps(facts)))), asdict(visit))
 

@@ -42,10 +42,10 @@ def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit):
     measured = detection.measure([PLANET.offset])[0]
     assert measured["contrast_error"] / measured["contrast"] == pytest.approx(0.1, rel=0.01)
     # An injected planet is as bright as it is in units of the same star.
-    injected = measured_planet(detection, PLANET.offset, fit.frames[0].flux)
+    injected = measured_planet(detection, PLANET.offset, fit.frames[0].star_light)
     assert injected.detected
     assert 1 < injected.contrast_error * injected.snr / injected.contrast < 1.5
-    brighter = measured_planet(detection, PLANET.offset, 2 * fit.frames[0].flux)
+    brighter = measured_planet(detection, PLANET.offset, 2 * fit.frames[0].star_light)
     assert brighter.contrast == pytest.approx(injected.contrast / 2)
     assert brighter.contrast_error == pytest.approx(injected.contrast_error / 2)
     assert brighter.snr == injected.snr

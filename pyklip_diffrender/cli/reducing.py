@@ -53,7 +53,7 @@ _MAST = "mast"
 
 @dataclass(frozen=True)
 class _Start:
-    """What the reductions of a command start from, beside their frames."""
+    """Options and starting maps of a command's reductions."""
 
     opd: str
     opd_date: Rule | None

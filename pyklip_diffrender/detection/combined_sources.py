@@ -597,7 +597,7 @@ def _snr(values: Mapping[str, _Value]) -> float:
 
 
 def _snr_at(maps: Sequence[SkyMap], place: Image) -> float:
-    """The same for maps at a place, (2,)."""
+    """Root of the summed squares of the positive S/N of maps at a place, (2,)."""
     return _snr({each.name: _value(each, place) for each in maps})
 
 

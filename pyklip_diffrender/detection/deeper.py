@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, is_within, separation_of, star_light
+from pyklip_diffrender.detection.field import Image, is_within, separation_of
 from pyklip_diffrender.detection.search_result import Detection
 
 _SAME_SOURCE_LAMBDA_D = 0.5
@@ -29,9 +29,9 @@ lambda/D at S/N 5."""
 
 
 def stated_limits(detection: Detection) -> tuple[Image, Image]:
-    """Separations, arcsec, and stated limits in units of light, see `star_light`."""
+    """Separations, arcsec, and stated limits in units of light, see `FrameFit.star_light`."""
     curve = detection.contrast_curve
-    light = star_light(detection.fits[0])
+    light = detection.fits[0].frames[0].star_light
     return curve["separation"].to_value("arcsec"), light * np.asarray(curve["contrast"])
 
 
@@ -51,7 +51,8 @@ def deeper(first: Detection, second: Detection) -> Detection:
     # Between the separations of the curve, the nearest one decides.
     nearest = np.abs(separation_of(first.grid)[..., None] - separations).argmin(axis=-1)
     region = is_deeper[nearest]
-    scale = star_light(second.fits[0]) / star_light(first.fits[0])
+    one, two = (each.fits[0].frames[0].star_light for each in (first, second))
+    scale = two / one
 
     def chosen(one: Image, other: Image) -> Image:
         return np.where(region, other, one)

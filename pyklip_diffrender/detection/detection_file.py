@@ -240,7 +240,7 @@ def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     if len(shapes) > 1 or maps["snr"].ndim != 2:
         raise ValueError(f"maps have the shapes {sorted(shapes)}")
     factor = ErrorFactor(factors, freedom, maps["grid"])
-    if not factor.is_measured:
+    if not factor.is_measured and np.ptp(factors) == 0:
         factor = ErrorFactor.constant(float(factors[0, 0]))
     return {**maps, "error_factor": factor}
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
@@ -57,17 +56,6 @@ def pixels_of(grid: Image, offsets: Image) -> Image:
     origin = grid[0, 0]
     steps = np.stack([grid[0, 1] - origin, grid[1, 0] - origin], axis=1)
     return np.asarray((offsets - origin) @ np.linalg.inv(steps).T)
-
-
-def star_light(fit: Refinement) -> float:
-    """Light of the star that passes the Lyot stop in the first frame, in the unit of the frames.
-
-    It is what contrasts of two fits have in common: the data determine the light of a source, while
-    the fits may differ in the star's flux and in the transmission of the stop.
-    """
-    frame = fit.frames[0]
-    opd = torch.from_numpy(np.ascontiguousarray(frame.opd))
-    return frame.flux * float(frame.model.transmission(opd, **frame.optical_values))
 
 
 def is_within(region: NDArray[np.bool_], grid: Image, offsets: Image) -> NDArray[np.bool_]:

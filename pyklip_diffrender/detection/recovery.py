@@ -20,7 +20,6 @@ from pyklip_diffrender.detection.field import (
     curve_separations,
     far_from,
     is_within,
-    star_light,
 )
 from pyklip_diffrender.detection.measurement import significance_of
 from pyklip_diffrender.detection.search_result import Detection
@@ -126,7 +125,7 @@ def recover_planets(
         again = search(with_planets(frames, injected))
         for planet in injected:
             angle = full_circle(planet.position_angle + detection.north)
-            measured = measured_planet(again, planet.offset, frames[0].flux)
+            measured = measured_planet(again, planet.offset, frames[0].star_light)
             rows.append((planet.separation, angle, planet.contrast, *measured))
     separation, angles, true, *found, detected = np.array(rows, dtype=float).reshape(-1, 7).T
     return add_columns(
@@ -162,15 +161,15 @@ def with_planets(frames: Sequence[FrameFit], planets: Sequence[Planet]) -> tuple
 
 
 def measured_planet(
-    detection: Detection, place: tuple[float, float], flux: float
+    detection: Detection, place: tuple[float, float], star_light: float
 ) -> MeasuredPlanet:
     """Measure a planet at a known place, x, y from the star in the first frame, arcsec.
 
-    `flux` is the flux of the star to which the contrast is relative, in the unit of
-    `FrameFit.flux`; for an injected planet, the flux in the fit with which it was rendered.
+    The contrast is relative to a star of this `FrameFit.star_light`; for an injected planet, of the
+    fit with which it was rendered.
     """
     sources, factor = detection.sources, detection.error_factor
-    unit = detection.fits[0].frames[0].flux / flux
+    unit = detection.fits[0].frames[0].star_light / star_light
     distances = np.hypot(*(sources.offsets.numpy() - place).T)
     if len(sources) and distances.min() < _SAME_ARCSEC:
         k = int(distances.argmin())
@@ -401,7 +400,7 @@ class _Searched:
     residual: Image  # (ny, nx), the numerator of the maps.
     sources: Tensor  # (k, 2), x, y of the candidates from the star, arcsec.
     threshold: float
-    star: float  # Light of the star in the fit, see `star_light`.
+    star: float  # Light of the star in the fit, see `FrameFit.star_light`.
 
     @classmethod
     def of(cls, detection: Detection, inner: float, progress: bool) -> _Searched:
@@ -412,7 +411,7 @@ class _Searched:
             maps.without(known),
             known.offsets,
             detection.threshold,
-            star_light(detection.fits[0]),
+            detection.fits[0].frames[0].star_light,
         )
 
     def finds(self, change: Image, place: Image) -> bool:

@@ -42,7 +42,6 @@ from pyklip_diffrender.detection.field import (
     is_within,
     pixels_of,
     places_of,
-    star_light,
 )
 from pyklip_diffrender.detection.measurement import (
     candidate_table,
@@ -464,7 +463,7 @@ class Detection:
         places = np.stack([raw["x"].value, raw["y"].value], axis=1)
         theirs, errors = self.other._contrasts_at(places)
         # Relative to the star of this search, as the map is.
-        one, two = (star_light(each._searched[0][0]) for each in (self, self.other))
+        one, two = (each._searched[0][0].frames[0].star_light for each in (self, self.other))
         chosen = is_within(self.of_other, self.grid, places)
         for name, unit in (("contrast", two / one), ("contrast_error", two / one), ("snr", 1.0)):
             raw[name] = np.where(chosen, unit * theirs[name], raw[name])

@@ -450,7 +450,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
 
 
 def _use_of_references(subtraction: Subtraction) -> str:
-    """What the frames of reference stars were used for; empty for other subtractors."""
+    """Use of the frames of reference stars in words; empty for other subtractors."""
     return "" if subtraction.reduction is None else subtraction.reduction.visit.in_words()
 
 

@@ -146,9 +146,8 @@ class Visit:
 
     # One for each frame of a reference star.
     contributions: tuple[Contribution, ...] = ()
-    # Limits of the target's frames alone over the limits of all frames, in units of flux: the
-    # median over the separations from 0.4 to 2 arcsec at which all frames are used. NaN if they
-    # are used nowhere.
+    # Limits of the target's frames alone over the limits of all frames, in units of light: the
+    # median over the separations at which all frames are used. NaN if they are used nowhere.
     gain: float = math.nan
     # These separations in words, such as "at 0.2 to 0.5 arcsec"; empty for all.
     where: str = ""
@@ -168,7 +167,7 @@ class Visit:
             # KLIP is not a use by the fit.
             use = "not used" if each["use"] == "KLIP only" else each["use"]
             contributions.append(Contribution(**known({**each, "use": use})))
-        return cls(tuple(contributions), known(facts)["gain"])
+        return cls(tuple(contributions), known(facts)["gain"], facts["where"])
 
     @property
     def unused(self) -> tuple[Contribution, ...]:
@@ -176,7 +175,7 @@ class Visit:
         return tuple(each for each in self.contributions if each.use == "not used")
 
     def in_words(self) -> str:
-        """What the frames were used for in a line, and why some were not."""
+        """Uses of the frames in a line, and reasons why some were not used."""
         counts = Counter(each.use for each in self.contributions)
         total = len(self.contributions)
         if not total:
@@ -530,13 +529,12 @@ def _with_companions_masked(
 
 
 def _gain(alone: Refinement, joint: Refinement) -> float:
-    """Median over separations of the limits of one fit over another's, in units of flux."""
-    return float(np.nanmedian(_flux_errors(alone) / _flux_errors(joint)))
+    """Median over separations of the limits of one fit over another's, in units of light."""
+    return float(np.nanmedian(_light_errors(alone) / _light_errors(joint)))
 
 
-def _flux_errors(fit: Refinement) -> NDArray[np.float64]:
-    """Errors of the fluxes of point sources, medians of the positions at each separation."""
-    # Errors of contrasts cannot be compared: the fits may differ in the flux of the star.
+def _light_errors(fit: Refinement) -> NDArray[np.float64]:
+    """Errors of the light of point sources, medians of the positions at each separation."""
     groups, edge = groups_of([fit]), float(np.abs(fit.frames[0].grid).max())
     separations = [each for each in _SEPARATIONS if each < edge] or [edge / 2]
     rings = ring_pixels(groups[0][1].grid, np.array(separations), _POSITIONS_PER_SEPARATION)
@@ -544,13 +542,13 @@ def _flux_errors(fit: Refinement) -> NDArray[np.float64]:
     products = weigh(groups, lambda templates: templates.at_pixels(rows, columns))
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
     errors = np.split(products.information.numpy() ** -0.5, ends)
-    return fit.frames[0].flux * np.array([np.median(each) for each in errors if len(each)])
+    return fit.frames[0].star_light * np.array([np.median(each) for each in errors if len(each)])
 
 
 def _stated_gains(
     alone: Detection, joint: Detection
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Separations, arcsec, and stated limits of one search over another's, by flux."""
+    """Separations, arcsec, and stated limits of one search over another's, by light."""
     separations, limits = stated_limits(alone)
     gains = limits / np.interp(separations, *stated_limits(joint))
     return separations, gains

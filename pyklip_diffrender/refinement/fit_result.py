@@ -175,6 +175,22 @@ class FrameFit:
         return float(self.values["flux"][0])
 
     @property
+    def transmission(self) -> float:
+        """Part of the light of a source far from the occulter that pupil planes let through."""
+        # A tensor, because the wavefront is complex where the pupil's amplitude was fitted.
+        opd = torch.from_numpy(np.ascontiguousarray(self.opd))
+        return float(self.model.transmission(opd, **self.optical_values))
+
+    @property
+    def star_light(self) -> float:
+        """Light of the star behind the Lyot stop, in the unit of the observation.
+
+        Two fits of the same frames may differ in the star's flux and in the transmission. The data
+        determine the light of a source, so that this is what relates contrasts of the two.
+        """
+        return self.flux * self.transmission
+
+    @property
     def pedestal(self) -> float:
         """Light per pixel that the pattern multiplies besides the star; 0 without a pattern."""
         return float(self.values["pedestal"][0]) if "pedestal" in self.values else 0.0

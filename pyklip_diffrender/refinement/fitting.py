@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 from astropy import units as u
 
 from pyklip_diffrender.errors import (
@@ -447,10 +446,7 @@ def jansky_per_unit(frame: FrameFit) -> float | None:
     # the solid angle of a pixel for which the pipeline calculated surface brightness (PIXAR_SR).
     if area is None:
         return None
-    # A tensor, because the wavefront is complex where the pupil's amplitude was fitted.
-    opd = torch.from_numpy(np.ascontiguousarray(frame.opd))
-    transmission = frame.model.transmission(opd, **frame.optical_values)
-    return float(transmission * area * frame.observation.unit.to(_FRAME_UNIT) * 1e6)
+    return float(frame.transmission * area * frame.observation.unit.to(_FRAME_UNIT) * 1e6)
 
 
 def to_jansky(star_flux: float | str | u.Quantity) -> float:

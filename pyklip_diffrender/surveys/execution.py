@@ -71,7 +71,7 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
     write_products(reduction, folder, fit=job.injection is None)
     result = _result(summarise(reduction))
     if job.injection is not None and job.base is not None:
-        result["recovered"] = _recovered(reduction, job.injection, frames[0].flux)
+        result["recovered"] = _recovered(reduction, job.injection, frames[0].star_light)
     return result
 
 
@@ -101,12 +101,12 @@ def _planet(injection: Injection, north: float) -> Planet:
     return Planet(injection.contrast, injection.separation, injection.angle - north)
 
 
-def _recovered(reduction: ReductionResult, planet: Injection, flux: float) -> dict[str, Any]:
-    """Measure an injected planet, as a contrast to a star of that flux."""
+def _recovered(reduction: ReductionResult, planet: Injection, star_light: float) -> dict[str, Any]:
+    """Measure an injected planet, as a contrast to a star of this light."""
     detection = reduction.detection
     # The planet's candidate, or else, without one, the flux at the place of the injection.
     place = _planet(planet, detection.north).offset
-    measured = measured_planet(detection, place, flux)._asdict()
+    measured = measured_planet(detection, place, star_light)._asdict()
     return {key: value if math.isfinite(value) else None for key, value in measured.items()}
 
 

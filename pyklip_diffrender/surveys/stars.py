@@ -128,7 +128,7 @@ def _search(star: str, group: Group, output: Path, spectra: Sequence[str]) -> St
 
 
 def _combined_in(data: Path) -> Mapping[str, Any] | None:
-    """What ``comparison.json`` has of a search; None if there is no such file, or a damaged one."""
+    """Search in a ``comparison.json``; None if there is no such file, or a damaged one."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         combined: Mapping[str, Any] = json.loads(read_text(data))["combined"]
         return combined
