@@ -9,14 +9,10 @@ import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.refinement import FitSettings
+from pyklip_diffrender.refinement.accurate_steps import ModelDerivatives, conjugate_gradients
+from pyklip_diffrender.refinement.equations import linearise
 from pyklip_diffrender.refinement.forward import Forward, FrameDerivatives, Problem, allowance
-from pyklip_diffrender.refinement.solver import (
-    ModelDerivatives,
-    Solver,
-    StepState,
-    conjugate_gradients,
-    linearise,
-)
+from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.scene import DetectorPattern
 from pyklip_diffrender.wavefront import WavefrontPrior, default_basis
 

@@ -1,0 +1,223 @@
+"""Gauss-Newton steps with derivatives of the model itself, by conjugate gradients.
+
+Normal equations of a coarse copy of the model are wrong where the effects of several unknowns
+cancel, and steps along such directions are too long. Products of the model's own curvature with a
+vector take as long as three images. The coarse copy's equations precondition them, and may come
+from an earlier step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.linear.model import (
+    LinearFrame,
+    Noise,
+)
+from pyklip_diffrender.refinement.forward import (
+    Objective,
+    State,
+)
+
+_GRADIENT_ITERATIONS = 6
+_GRADIENT_TOLERANCE = 0.05
+
+_CURVATURE_ROUNDING = 1e-12
+"""Relative error of the curvature's elements."""
+
+_CURVATURE_STEP_RATIO = 0.01
+"""Part of a step between the images whose difference is a derivative. Over this part, curvature
+matters less than the rounding errors of single precision."""
+
+
+class ModelDerivatives:
+    """Gradient and curvature of chi-squared, by derivatives of the model itself.
+
+    The curvature has the approximate derivatives of the frames `rough`, by index.
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        state: State,
+        noise: Noise,
+        rough: Mapping[int, LinearFrame] | None = None,
+    ) -> None:
+        self._objective, self._state, self._noise = objective, state, noise
+        self._rough = rough or {}
+        self._levels = [
+            forward.levels(point, point.unknowns.visible_sources(point.vector)).double()
+            for forward, point in zip(objective.forwards, state.points, strict=True)
+        ]
+        self._bright = [point.unknowns.are_bright(point.vector) for point in state.points]
+        # The gradient includes all light. In the curvature, which determines the path to the
+        # minimum and not its place, the light of faint companions is linear: it depends on their
+        # contrasts and positions and on the star's flux, and not on the wavefront.
+        self._without_faint = [
+            point if bool(bright.all()) else forward.at(point.unknowns, point.vector, bright)
+            for forward, point, bright in zip(
+                objective.forwards, state.points, self._bright, strict=True
+            )
+        ]
+
+    def gradient(self) -> Tensor:
+        """Minus half the derivative of chi-squared, (unknowns,)."""
+        sources = [point.unknowns.visible_sources(point.vector) for point in self._state.points]
+        return self._pull(dict(enumerate(self._objective.residuals(self._state))), sources, {})
+
+    def product(self, step: Tensor) -> Tensor:
+        """Product of the curvature with a step, (unknowns,)."""
+        # A s = J C^-1 (J^T s): a difference of two images along the step s has J^T s, and `_pull`
+        # applies J C^-1 in reverse mode.
+        vector, images, sources = self._state.vector + _CURVATURE_STEP_RATIO * step, {}, []
+        for k, before in enumerate(self._without_faint):
+            sources.append(before.unknowns.visible_sources(before.vector)[self._bright[k]])
+            if k in self._rough:
+                images[k] = self._rough[k].image(step).to(before.total.device)
+                continue
+            rows, bright = self._state.unknowns.rows[k], self._bright[k]
+            after = self._objective.forwards[k].at(
+                before.unknowns, rows.of_unknowns(vector), bright
+            )
+            images[k] = (after.total - before.total) / _CURVATURE_STEP_RATIO
+            if not bool(bright.all()):
+                images[k] = images[k] + self._change_of_faint(k, rows.of_unknowns(step))
+        return self._pull(images, sources, self._rough)
+
+    def _change_of_faint(self, k: int, step: Tensor) -> Tensor:
+        """Change of the light of faint companions in a frame by a step of its unknowns."""
+        point = self._state.points[k]
+        unknowns, faint = point.unknowns, ~self._bright[k]
+        of_companions = step[unknowns.where("companions")]
+        rows = self._levels[k][-len(of_companions) :].unflatten(0, (-1, 3))[faint].flatten(0, 1)
+        change = torch.tensordot(of_companions.reshape(-1, 3)[faint].flatten(), rows, dims=1)
+        light = point.total - self._without_faint[k].total
+        change_of_flux = unknowns.level("flux", step) if "flux" in unknowns.linear else 0.0
+        relative = change_of_flux / unknowns.level("flux", point.vector)
+        return relative * light + change.to(light.device)
+
+    def _pull(
+        self,
+        images: Mapping[int, Tensor],
+        sources: Sequence[Tensor],
+        rough: Mapping[int, LinearFrame],
+    ) -> Tensor:
+        """Product of the whitened Jacobian with images of all frames, which are whitened here.
+
+        The Jacobian by optics and wavefront includes the star and `sources`, (k, 3) by frame;
+        frames in `rough` have their approximate Jacobian.
+        """
+        objective, unknowns = self._objective, self._state.unknowns
+        total = torch.zeros(unknowns.size, dtype=torch.float64)
+        whitened = self._noise.inverse(images)
+        for k, (forward, point) in enumerate(
+            zip(objective.forwards, self._state.points, strict=True)
+        ):
+            # `inverse` has C^-1 x over w. Levels and companions have images in `_levels`, and the
+            # derivatives by the other unknowns come from reverse mode.
+            pixels = self._noise.weight[k] * whitened[k]
+            if k in rough:
+                on_rows = rough[k].pulled(pixels.cpu()[None])
+                total += rough[k].onto_unknowns(on_rows, unknowns.size)[:, 0]
+                continue
+            where, levels = point.unknowns.slices, self._levels[k]
+            of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
+            last = where["companions"].stop
+            of_frame[last - len(levels) : last] = levels.flatten(1) @ pixels.cpu().flatten()
+            for name, slopes in forward.slopes(point, pixels, sources[k]).items():
+                of_frame[where[name]] = slopes
+            total += unknowns.rows[k].onto_unknowns(of_frame, unknowns.size)
+        return total
+
+
+def accurate_step(
+    derivatives: ModelDerivatives,
+    curvature: Tensor,
+    offset: Tensor,
+    deviation: Tensor,
+    enough: float,
+    *,
+    volume: Tensor | float = 0.0,
+    iterations: int = _GRADIENT_ITERATIONS,
+    sufficient: float = _GRADIENT_TOLERANCE,
+) -> tuple[Tensor, bool]:
+    """Compute the step (unknowns,) to the minimum of the linearised penalised chi-squared.
+
+    `curvature` (some, some) is approximate and by the leading unknowns, the only ones that the step
+    changes. `offset` (unknowns,) is from the means of the priors, whose standard deviations are
+    `deviation`, and `volume` (some,) is added to the gradient. See `conjugate_gradients` for the
+    flag and the last arguments.
+    """
+    count = len(curvature)
+    # The step s minimises s (A + p) s - 2 s (g - p x0), with the curvature A and gradient g of the
+    # model itself, the priors' precision p, and the offset x0 from their means. A + p is known by
+    # its products with vectors, and the approximate curvature preconditions it.
+    precision = deviation[:count] ** -2
+    # Unknowns differ by many powers of ten, so the system is solved in scaled units.
+    unit = (curvature.diagonal() + precision).clamp(min=1e-300) ** -0.5
+    system = (curvature * unit[:, None]).mul_(unit)
+    system.diagonal().mul_(1 + _CURVATURE_ROUNDING).add_(precision * unit**2)
+    factor = torch.linalg.cholesky(system)
+    step = torch.zeros_like(offset)
+
+    def product(scaled: Tensor) -> Tensor:
+        step[:count] = unit * scaled
+        return unit * (derivatives.product(step)[:count] + precision * step[:count])
+
+    def precondition(scaled: Tensor) -> Tensor:
+        return torch.cholesky_solve(scaled[:, None], factor)[:, 0]
+
+    gradient = derivatives.gradient()[:count] - precision * offset[:count] + volume
+    scaled, settled = conjugate_gradients(
+        product, precondition, unit * gradient, enough, iterations, sufficient
+    )
+    step[:count] = unit * scaled
+    return step, settled
+
+
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    gradient: Tensor,
+    enough: float = 0.0,
+    iterations: int = _GRADIENT_ITERATIONS,
+    sufficient: float = _GRADIENT_TOLERANCE,
+) -> tuple[Tensor, bool]:
+    """Minimise x A x - 2 g x approximately; also whether another iteration would hardly lower it.
+
+    `product` gives A x with a positive definite A, `precondition` B^-1 x with an approximation B to
+    A, and `gradient` g is (n,). The iteration is the last whose decrease is below `enough`, or
+    below the part `sufficient` of the whole decrease.
+    """
+    # Along a direction p, with the remaining gradient r = g - A x and z = B^-1 r, the minimum is at
+    # the length (r . z) / (p . A p) and lowers the function by (r . z)^2 / (p . A p), since r is
+    # orthogonal to the earlier directions. Every iteration lowers it, however poor the
+    # preconditioner is; a few are sufficient where that is wrong in a few directions only.
+    x = torch.zeros_like(gradient)
+    remaining = gradient.clone()
+    direction = precondition(remaining)
+    power, total = float(remaining @ direction), 0.0
+    for _ in range(iterations):
+        if power <= 0:
+            return x, True
+        # What the preconditioner expects does not tell the decrease. Errors of its Jacobian count
+        # as curvature along a direction in which the effects of unknowns cancel.
+        pulled = product(direction)
+        curvature = float(direction @ pulled)
+        if curvature <= 0:  # By rounding errors.
+            return x, True
+        x += power / curvature * direction
+        remaining -= power / curvature * pulled
+        decrease = power**2 / curvature
+        total += decrease
+        # SciPy's `cg` ends by the size of the gradient, which says little where unknowns are nearly
+        # degenerate.
+        if decrease < max(sufficient * total, enough):
+            return x, True
+        ahead = precondition(remaining)
+        power, before = float(remaining @ ahead), power
+        direction = ahead + power / before * direction
+    return x, False
