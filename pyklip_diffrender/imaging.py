@@ -33,11 +33,11 @@ import torch
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.ndimage import gaussian_filter
-from scipy.signal import fftconvolve
 from torch import Tensor
 
 from pyklip_diffrender.detection.templates import Templates, groups_of
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.convolution import fft_convolve
 from pyklip_diffrender.refinement import Refinement
 
 # Interpolation of an image at many places, as a sparse matrix.
@@ -212,7 +212,7 @@ class SkyModel:
             ny, nx = linear.frames[0].residual.shape
             images.append(
                 {
-                    k: torch.from_numpy(_convolved((m @ flat).T.reshape(-1, ny, nx), source))
+                    k: torch.from_numpy(fft_convolve((m @ flat).T.reshape(-1, ny, nx), source))
                     for k, m in matrices.items()
                 }
             )
@@ -225,7 +225,7 @@ class SkyModel:
             cleaned = linear.clean(each)
             for k, matrix in matrices.items():
                 whitened = (linear.frames[k].weight * cleaned[k]).numpy()
-                matched = _convolved(whitened, source[::-1, ::-1])
+                matched = fft_convolve(whitened, source[::-1, ::-1])
                 total = total + np.asarray(matrix.T @ matched.reshape(len(matched), -1).T)
         return np.asarray(total).T.reshape(-1, *self.shape)
 
@@ -346,11 +346,6 @@ class SkyModel:
                     sums[k].append(torch.tensordot(weight, image.double(), dims=1))
             light.append({k: torch.stack(images) for k, images in sums.items()})
         return light
-
-
-def _convolved(images: Image, kernel: Image) -> Image:
-    """Convolve images, (k, ny, nx), with a kernel; zero beyond their edges."""
-    return np.asarray(fftconvolve(images, kernel[None], mode="same", axes=(1, 2)))
 
 
 def _by_ring(values: Image, at: Image, distance: Image) -> Image:

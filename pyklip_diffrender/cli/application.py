@@ -23,6 +23,7 @@ from pyklip_diffrender.cli.session import (
     declared,
     file_type,
     free_memory,
+    importing,
     keep_freed_memory,
     named_files,
     open_streams,
@@ -77,8 +78,9 @@ def demo(
     """
     products = named_files(output, _DEMO, overwrite)
     run.claim_folder(output, _DEMO)
-    from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
-    from pyklip_diffrender.drawing import save
+    with importing():
+        from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
+        from pyklip_diffrender.drawing import save
 
     result = run_demo(
         contrast=contrast,
@@ -199,7 +201,8 @@ def reduce_frames(
             )
         return ExposureSequence.by_filter_and_epoch(files, target=target, filter=filter, star=star)
 
-    from pyklip_diffrender.cli.reducing import run_reduction
+    with importing():
+        from pyklip_diffrender.cli.reducing import run_reduction
 
     run_reduction(run, read, **options)
 
@@ -236,7 +239,8 @@ def detect_in_file(
             )
         return (ExposureSequence.from_files([frames], star=star),)
 
-    from pyklip_diffrender.cli.reducing import run_reduction
+    with importing():
+        from pyklip_diffrender.cli.reducing import run_reduction
 
     run_reduction(run, read, **options)
 
@@ -330,7 +334,8 @@ def survey(run: Run, /, file: Path, output: Path, scheduler: str | None) -> int:
     FILE is a TOML file with the sequences and their options. The same command goes on where an
     earlier one was stopped.
     """
-    from pyklip_diffrender.cli.reducing import run as run_survey
+    with importing():
+        from pyklip_diffrender.cli.reducing import run as run_survey
 
     return run_survey(file, output, scheduler, progress=run.progress)
 

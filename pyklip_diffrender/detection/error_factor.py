@@ -27,8 +27,8 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 from scipy.ndimage import binary_dilation, convolve, map_coordinates, maximum_filter
+from scipy.special import chdtri
 from torch import Tensor
 
 from pyklip_diffrender.detection.field import (
@@ -38,6 +38,12 @@ from pyklip_diffrender.detection.field import (
     pixels_of,
     reaching,
     separation_of,
+)
+from pyklip_diffrender.detection.tails import (
+    gaussian_sigmas,
+    gaussian_tail,
+    student_snr,
+    student_tail,
 )
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.refinement.residual import local_maxima
@@ -69,7 +75,7 @@ raise the threshold of others."""
 _FITTED_PIXEL_STEP = 2
 """Distance between the rows, and the columns, of pixels to which the factor is fitted."""
 
-_MEDIAN_SQUARE = float(stats.chi2.median(1))
+_MEDIAN_SQUARE = float(chdtri(1, 0.5))
 """Median of the square of Gaussian noise."""
 
 _FIT_STEPS = 30
@@ -148,16 +154,16 @@ class ErrorFactor:
 
     def false_alarm(self, snr: ArrayLike, offsets: Tensor | Image) -> Image:
         """Probability that noise at one position exceeds an S/N of the multiplied errors."""
-        return np.asarray(stats.t.sf(snr, self._freedom_of(offsets)))
+        return student_tail(snr, self._freedom_of(offsets))
 
     def threshold(self, sigmas: float, offsets: Tensor | Image) -> Image:
         """S/N that noise at a position exceeds as rarely as Gaussian noise exceeds `sigmas`."""
-        return np.asarray(stats.t.isf(stats.norm.sf(sigmas), self._freedom_of(offsets)))
+        return student_snr(sigmas, self._freedom_of(offsets))
 
     def threshold_at(self, sigmas: float, separation: ArrayLike) -> Image:
         """Threshold at separations, arcsec, from the median of the degrees of freedom."""
         freedom = _inverse(self._on_circles(1 / self.freedom, separation))
-        return np.asarray(stats.t.isf(stats.norm.sf(sigmas), freedom))
+        return student_snr(sigmas, freedom)
 
     def _freedom_of(self, offsets: Tensor | Image) -> Image:
         # Interpolated as its inverse, which is finite.
@@ -436,14 +442,14 @@ class Significance:
     @staticmethod
     def sigmas(snr: ArrayLike, freedom: ArrayLike) -> Image:
         """Standard deviations that Gaussian noise exceeds as rarely as Student's t the S/N."""
-        return np.asarray(stats.norm.isf(stats.t.sf(snr, freedom)))
+        return gaussian_sigmas(student_tail(snr, freedom))
 
     def false_alarms(self, factor: ErrorFactor, snr: Image, offsets: Tensor | Image) -> Image:
         """Probabilities, (k,), that noise makes peaks of such S/N anywhere in the field.
 
         `snr` (k,) is with errors multiplied by the factor; `offsets` (k, 2) are x, y, arcsec.
         """
-        sigmas = stats.norm.isf(factor.false_alarm(snr, offsets))
+        sigmas = gaussian_sigmas(factor.false_alarm(snr, offsets))
         return np.array([self.false_alarm(float(each)) for each in sigmas])
 
     def false_alarm(self, sigmas: float) -> float:
@@ -471,7 +477,7 @@ class Significance:
         expected = (
             valid.sum() * density * sigmas * falloff / (2 * math.pi) ** 1.5
             + edge * falloff / (2 * math.pi)
-            + float(stats.norm.sf(sigmas))
+            + float(gaussian_tail(sigmas))
         )
         return -math.expm1(-expected)
 

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import hermite_e
 from numpy.typing import ArrayLike, NDArray
-from scipy import optimize, stats
+from scipy import optimize
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.special import gamma, logsumexp
@@ -27,6 +27,7 @@ from pyklip_diffrender.detection.field import (
     separation_of,
 )
 from pyklip_diffrender.detection.search_result import Detection
+from pyklip_diffrender.detection.tails import gaussian_sigmas, gaussian_tail, student_tail
 from pyklip_diffrender.io.units import east_and_north
 from pyklip_diffrender.scene.admission import EPOCH
 
@@ -311,7 +312,7 @@ def _gaussian(snr: Image, freedom: ArrayLike) -> Image:
     """Gaussian standard deviations that are as rare as an S/N, which follows Student's t."""
     height, freedom = np.abs(snr), np.asarray(freedom, dtype=float)
     with np.errstate(divide="ignore"):
-        exact = stats.norm.isf(stats.t.sf(height, freedom))
+        exact = gaussian_sigmas(student_tail(height, freedom))
     # Beyond the smallest numbers, within 0.01: D. L. Wallace, Annals of Mathematical Statistics 30,
     # 1121 (1959).
     few = np.where(np.isfinite(freedom), freedom, 1.0)
@@ -500,7 +501,7 @@ def _size(shares: Image, curvature: Image) -> Image:
 def _density(dimension: int, level: float) -> float:
     """Density of the Euler characteristic of a Gaussian field above a level."""
     if dimension == 0:
-        return float(stats.norm.sf(level))
+        return float(gaussian_tail(level))
     polynomial = hermite_e.hermeval(level, [0] * (dimension - 1) + [1])
     return float(polynomial * math.exp(-(level**2) / 2) / (2 * math.pi) ** ((dimension + 1) / 2))
 

@@ -16,7 +16,6 @@ from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, map_coordinates, uniform_filter
-from scipy.signal import fftconvolve
 from torch import Tensor
 
 from pyklip_diffrender.detection.field import (
@@ -25,6 +24,7 @@ from pyklip_diffrender.detection.field import (
     separation_of,
 )
 from pyklip_diffrender.io.units import rotation_matrix
+from pyklip_diffrender.optics.convolution import fft_convolve
 from pyklip_diffrender.optics.planes import Detector
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement import FrameFit, Refinement
@@ -200,7 +200,7 @@ class WholeFrame:
     @cached_property
     def correlation(self) -> Image:
         """Autocorrelation of the S/N of noise, by distance in pixels."""
-        image = fftconvolve(self.kernel, self.kernel[::-1, ::-1])
+        image = fft_convolve(self.kernel, self.kernel[::-1, ::-1], full=True)
         middle, reach = _MATCHED_FILTER_PIXELS - 1, _MATCHED_FILTER_PIXELS // 2
         near = slice(middle - reach, middle + reach + 1)
         return np.asarray(image[near, near] / image[middle, middle])
@@ -210,9 +210,7 @@ class WholeFrame:
         """Star over noise, averaged with the squared S/N that a source has in each pixel."""
         weight, squares = self.sigma**-2.0, self.kernel[::-1, ::-1] ** 2
         ratio = np.where(weight > 0, self.stars / self.sigma, 0.0)
-        light, total = (
-            fftconvolve(each, squares, mode="same") for each in (weight * ratio, weight)
-        )
+        light, total = (fft_convolve(each, squares) for each in (weight * ratio, weight))
         return np.asarray(np.maximum(light, 0) / np.maximum(total, 1e-300))
 
     def products(self, image: Image) -> tuple[Image, Image]:
@@ -224,7 +222,7 @@ class WholeFrame:
         flat = np.ones_like(source)
 
         def around(values: Image, kernel: Image) -> Image:
-            return np.asarray(fftconvolve(values, kernel, mode="same"))
+            return fft_convolve(values, kernel)
 
         total = np.maximum(around(weight, flat), 1e-300)
         mixed = around(weight, source)

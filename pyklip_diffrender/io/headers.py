@@ -181,7 +181,9 @@ def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time |
         if text is None:
             continue
         try:
-            return Time(text, scale="utc")
+            # With a format, because the guesses of astropy hold the errors of its trials, and with
+            # them all that the callers have in memory, until garbage is collected.
+            return Time(text.replace(" ", "T"), format="isot", scale="utc")
         except ValueError as error:
             raise card_error(name, key, text, "a date such as '2022-08-11T01:02:03'") from error
     return None
@@ -196,7 +198,7 @@ def day_and_time(header: fits.Header, name: str) -> Time | None:
     if not (day and hour) or "T" in day:
         return None
     try:
-        return Time(f"{day}T{hour}", scale="utc")
+        return Time(f"{day}T{hour}", format="isot", scale="utc")
     except ValueError as error:
         expected = "a date such as '2022-08-11T01:02:03'"
         cards = "DATE-OBS with TIME-OBS"
@@ -217,7 +219,7 @@ def sensing_date(header: fits.Header, name: str) -> Time | None:
     if stated is not None or match is None:
         return stated
     try:
-        return Time("-".join(match.groups()), scale="utc")
+        return Time("-".join(match.groups()), format="isot", scale="utc")
     except ValueError:  # Digits that are no date.
         return None
 

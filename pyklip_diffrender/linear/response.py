@@ -280,7 +280,11 @@ def jacobian(function: Callable[[Tensor], Sequence[Tensor]], value: Tensor) -> l
         weights = [torch.zeros_like(each, requires_grad=True) for each in real]
         (gradient,) = torch.autograd.grad(real, varied, weights, create_graph=True)
     directions = torch.eye(len(gradient), dtype=gradient.dtype, device=gradient.device)
-    rows = torch.autograd.grad(gradient, weights, directions, is_grads_batched=True)
+    # One by one: torch.vmap, which would do them together, takes longer to import.
+    slopes = [
+        torch.autograd.grad(gradient, weights, each, retain_graph=True) for each in directions
+    ]
+    rows = [torch.stack(each) for each in zip(*slopes, strict=True)]
     return [
         torch.view_as_complex(each.contiguous()) if output.is_complex() else each
         for output, each in zip(outputs, rows, strict=True)

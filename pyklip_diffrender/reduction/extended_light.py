@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from astropy.table import QTable
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import gammainc
 
 _CHANCE_PROBABILITY = 0.01
 """Probability below which unrelated sources are not taken to be arranged by chance."""
@@ -39,7 +39,8 @@ def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
     # (reach / edge)^2, the ratio of two areas, so that their number is nearly Poisson's.
     reach = _NEIGHBOURS_LAMBDA_D * resolution
     expected = len(distances) * (reach / edge) ** 2
-    if stats.poisson.sf((distances < reach).sum() - 1, expected) < _CHANCE_PROBABILITY:
+    # The probability of n pairs or more is the regularised incomplete gamma function of n.
+    if gammainc((distances < reach).sum(), expected) < _CHANCE_PROBABILITY:
         return "Candidates are next to each other, like parts of an extended source"
     return ""
 

@@ -19,17 +19,17 @@ from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import NDArray
 from pyklip.klip import klip_math, rotate
-from scipy import stats
 from scipy.ndimage import map_coordinates
-from scipy.signal import fftconvolve
 
 from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import pixels_of
+from pyklip_diffrender.detection.tails import student_snr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.io.units import to_arcsec
+from pyklip_diffrender.optics.convolution import fft_convolve
 from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.star_place import without_gaps
@@ -238,9 +238,7 @@ def small_sample_factor(
     # with n - 2 degrees of freedom, times sqrt(1 + 1 / (n - 1)).
     elements = np.floor(2 * math.pi * np.asarray(separation, dtype=float) / resolution)
     freedom = np.maximum(elements - 2, 1)
-    threshold = stats.t.isf(stats.norm.sf(sigmas), freedom) * np.sqrt(
-        1 + 1 / np.maximum(elements - 1, 1)
-    )
+    threshold = student_snr(sigmas, freedom) * np.sqrt(1 + 1 / np.maximum(elements - 1, 1))
     return np.where(elements >= 3, threshold / sigmas, np.inf)
 
 
@@ -363,7 +361,7 @@ class KlipSubtraction:
     def images(self, science: Image) -> Image:
         """The residuals smoothed with the image of a planet, (modes, ny, nx)."""
         residuals = self.residuals(science)
-        return np.array([fftconvolve(each, self._kernel, mode="same") for each in residuals])
+        return fft_convolve(residuals, self._kernel)
 
 
 def _filled(observation: Observation) -> Image:

@@ -31,7 +31,7 @@ import torch
 from astropy.table import QTable
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from pyklip_diffrender.detection import (
     Detection,
@@ -473,7 +473,7 @@ def _unexplained(aligned: Refinement) -> float:
     noise = observation.error[0][valid] ** 2
 
     def excess(part: float) -> float:
-        return float(np.median(square / (noise + part**2 * light)) - chi2.ppf(0.5, 1))
+        return float(np.median(square / (noise + part**2 * light)) - chdtri(1, 0.5))
 
     if excess(0.0) <= 0:
         return 0.0

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, maximum_filter
-from scipy.signal import fftconvolve
 from torch import Tensor
 
 from pyklip_diffrender.linear.model import LinearModel, TemplateProducts
+from pyklip_diffrender.optics.convolution import fft_convolve
 from pyklip_diffrender.refinement.forward import Objective, State, pixel_grid
 from pyklip_diffrender.scene.objects import Planet
 
@@ -90,8 +90,8 @@ def _matched(objective: Objective, state: State, k: int, kappa: float) -> _Match
     weight = sigma**-2.0
     # Convolution with the reversed template has the sums at all places.
     return _Matched(
-        numerator=fftconvolve(residual * weight, template, mode="same"),
-        information=np.maximum(fftconvolve(weight, template**2, mode="same"), 0.0),
+        numerator=fft_convolve(residual * weight, template),
+        information=np.maximum(fft_convolve(weight, template**2), 0.0),
         grid=pixel_grid(model, values),
     )
 

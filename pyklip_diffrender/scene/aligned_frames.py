@@ -14,12 +14,12 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, fourier_shift, minimum_filter, uniform_filter
-from scipy.signal import fftconvolve
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.headers import header_number, header_text
 from pyklip_diffrender.io.units import native_float64, require_finite
+from pyklip_diffrender.optics.convolution import fft_convolve
 from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask, module_of
 from pyklip_diffrender.scene.star_place import measured_offset
 
@@ -282,10 +282,10 @@ def _spread(squares: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArra
         # A shifted pixel is the sum of k_j x_j, the kernel k being the shift of a single pixel, and
         # has the variance sum of k_j^2 v_j.
         kernel = np.zeros_like(variance)
-        # Where `fftconvolve` has the origin of a kernel.
+        # Where `fft_convolve` has the origin of a kernel.
         kernel[(kernel.shape[0] - 1) // 2, (kernel.shape[1] - 1) // 2] = 1.0
         kernel = np.fft.ifft2(fourier_shift(np.fft.fft2(kernel), shift[::-1])).real ** 2
-        result[k] = np.maximum(fftconvolve(variance, kernel, mode="same"), 0.0)
+        result[k] = np.maximum(fft_convolve(variance, kernel), 0.0)
     return result
 
 

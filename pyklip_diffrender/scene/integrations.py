@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from astropy import units as u
+from astropy.stats import mad_std
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, convolve, uniform_filter
-from scipy.stats import median_abs_deviation
 
 from pyklip_diffrender.errors import (
     IncompatibleSetupError,
@@ -374,7 +374,7 @@ def _deviating(difference: Stack, sigma: Stack, usable: Mask, allowed: Stack) ->
     weight = usable.astype(float)
     excess = np.maximum(np.abs(difference) - allowed, 0.0) * weight
     # Stated errors may be too small.
-    scatter = median_abs_deviation((difference / sigma)[usable], scale="normal")
+    scatter = mad_std((difference / sigma)[usable])
     noise = sigma * max(1.0, float(scatter))
     single = excess > _PIXEL_OUTLIER_SIGMAS * noise
     area = _PATCH_PIXELS**2
@@ -383,7 +383,7 @@ def _deviating(difference: Stack, sigma: Stack, usable: Mask, allowed: Stack) ->
     variance = uniform_filter(noise**2 * weight, _PATCH_PIXELS, mode="constant") * area
     spread = np.sqrt(np.where(variance > 0, variance, np.inf))
     # Noise that neighbouring pixels share, such as 1/f noise, adds up in squares.
-    shared = median_abs_deviation((total / spread)[usable], scale="normal")
+    shared = mad_std((total / spread)[usable])
     spread *= max(1.0, float(shared))
     smooth = np.abs(total) - tolerated > _PATCH_OUTLIER_SIGMAS * spread
     reach = np.ones((_PATCH_PIXELS, _PATCH_PIXELS), dtype=bool)
@@ -519,7 +519,7 @@ def dark_pixels(frame: Image, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     # means, or the darkest quarter of a field that is full of sources.
     # A single bright pixel is an outlier, and no source.
     median = np.median(frame[usable])
-    limit = 5 * median_abs_deviation(frame[usable], scale="normal")
+    limit = 5 * mad_std(frame[usable])
     clipped = np.where(usable, np.clip(frame - median, -limit, limit), 0.0)
     weight = uniform_filter(usable.astype(float), _DARK_BOX_PIXELS, mode="constant")
     smooth = uniform_filter(clipped, _DARK_BOX_PIXELS, mode="constant") / np.maximum(weight, 1e-3)
@@ -571,5 +571,5 @@ def _measured(
         # s_d^2) / 16, and `convolve` averages four.
         difference = frame - convolve(frame, _NEIGHBOURS, mode="nearest")
         predicted = np.sqrt(sigma**2 + convolve(sigma**2, _NEIGHBOURS, mode="nearest") / 4)
-        ratio = float(median_abs_deviation((difference / predicted)[far], scale="normal"))
+        ratio = float(mad_std((difference / predicted)[far]))
         yield ratio, float(np.median(sigma[far]))

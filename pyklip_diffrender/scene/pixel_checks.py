@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from astropy import units as u
+from astropy.stats import mad_std
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter, map_coordinates, shift, uniform_filter
-from scipy.stats import median_abs_deviation
 
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.scene.integrations import dark_pixels
@@ -377,7 +377,7 @@ def why_odd_unit(observation: Observation) -> str:
         return ""
     dark = dark_pixels(_mean(observation)[0], usable)
     # A pixel less the mean of four has the variance 1 + 1/4.
-    scatter = float(median_abs_deviation(difference[dark], scale="normal")) / 1.25**0.5
+    scatter = float(mad_std(difference[dark])) / 1.25**0.5
     low, high = _PLAUSIBLE_SCATTER_MJY_SR
     if low < scatter < high:
         return ""

@@ -21,7 +21,6 @@ import numpy as np
 from astropy import units as u
 from astropy.time import Time
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
 
 from pyklip_diffrender.errors import (
     CorruptFileError,
@@ -399,6 +398,9 @@ def _interpolated(opd: Array, npix: int) -> Array:
     Output sample i is at ``i dim / npix`` of the input's index and not at the same position in the
     pupil: the map moves by (1 - dim / npix) / 2 input samples, as in stpsf, for maps to agree.
     """
+    # Imported where it is used: few reductions read such maps.
+    from scipy.interpolate import RectBivariateSpline
+
     index = np.arange(len(opd), dtype=float)
     fine = np.arange(npix) * (len(opd) / npix)
     return native_float64(RectBivariateSpline(index, index, opd)(fine, fine))
