@@ -491,7 +491,7 @@ def test_images_have_north_up():
     images = SkyImages(whole)
     overview = Overview(images, klip)
     wrong = [replace(PLANET, position_angle=angle).offset for angle in (10.0, 70.0, -40.0, 220.0)]
-    for image, grid in ((images.combined[0], images.grid), (images.posterior_mean[0], images.grid),
+    for image, grid in ((images.combined[0], images.grid), (images.posterior_mean, images.grid),
                         (klip.image, klip.grid),
                         (images.turned(whole.detection.snr), images.grid)):  # fmt: skip
         # Its position on the frame, turned twice, mirrored, and on the other side.
@@ -523,7 +523,7 @@ def test_images_of_the_sky_are_written_with_coordinates(tmp_path):
         assert star.separation(peak).arcsec == pytest.approx(row["separation"].value, abs=0.07)
         angle = star.position_angle(peak).deg
         assert angle == pytest.approx(row["position_angle"].value, abs=8.0)
-        np.testing.assert_array_equal(hdus["POSTERIOR_MEAN"].data, images.posterior_mean[0])
+        np.testing.assert_array_equal(hdus["POSTERIOR_MEAN"].data, images.posterior_mean)
         # Far from planet and star it scatters as its errors say.
         away = np.hypot(*np.moveaxis(images.grid - PLANET.offset, -1, 0)) > 0.35
         away &= (np.hypot(*np.moveaxis(images.grid, -1, 0)) > 0.3) & np.isfinite(image)
@@ -535,6 +535,13 @@ def test_images_of_the_sky_are_written_with_coordinates(tmp_path):
         # The mean has the noise of the frames.
         noise = np.nanmedian(hdus["COMBINED_ERROR"].data)
         assert 0.5 < noise / np.nanmedian(whole.detection.observation.error) < 2
+
+
+def test_a_first_look_has_no_error_of_the_most_probable_image(tmp_path):
+    quick = SkyImages(replace(reduction(), accuracy="quick"))
+    with fits.open(quick.write(tmp_path / "images.fits")) as hdus:
+        assert "POSTERIOR_MEAN" in hdus
+        assert "POSTERIOR_MEAN_ERROR" not in hdus
 
 
 @pytest.mark.usefixtures("_few_pictures")

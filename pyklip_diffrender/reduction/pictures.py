@@ -46,7 +46,7 @@ class SkyImages:
 
     def __init__(self, reduction: ReductionResult) -> None:
         self.detection: Detection = reduction.detection
-        self._disk = reduction.disk
+        self._disk, self._is_quick = reduction.disk, reduction.accuracy == "quick"
         self._templates = self.detection.groups[0][1]
         observation = self.detection.observation
         self.oriented = observation.position_angles is not None
@@ -72,16 +72,29 @@ class SkyImages:
         return combine_frames(self._templates, images, errors, self.grid @ self.to_sky)
 
     @cached_property
-    def posterior_mean(self) -> tuple[Image, Image]:
-        """Light of neither star nor detector, and its standard deviation, in the frames' unit.
+    def _sky_model(self) -> SkyModel:
+        return SkyModel(self.detection.fits)
+
+    @cached_property
+    def posterior_mean(self) -> Image:
+        """Light of neither star nor detector, in the frames' unit.
 
         See `imaging`. Point sources have 0.4 to 1 of their peak, least close to the star,
         and no side lobes.
         """
-        model = SkyModel(self.detection.fits)
-        middle = slice(model.center - self._half, model.center + self._half + 1)
-        mean, error = (image[middle, middle] for image in (model.estimate()[0], model.error()))
-        return mean, error * self.detection.error_factor.of(self.grid @ self.to_sky)
+        return self._middle(self._sky_model.estimate()[0])
+
+    @cached_property
+    def posterior_mean_error(self) -> Image:
+        """Standard deviation of `posterior_mean`."""
+        error = self._middle(self._sky_model.error())
+        return error * self.detection.error_factor.of(self.grid @ self.to_sky)
+
+    def _middle(self, image: Image) -> Image:
+        """The pixels of `grid` in an image of the model of the sky."""
+        center = self._sky_model.center
+        middle = slice(center - self._half, center + self._half + 1)
+        return image[middle, middle]
 
     @cached_property
     def throughput(self) -> Image:
@@ -113,13 +126,17 @@ class SkyImages:
         detection = self.detection
         unit = fits_unit(detection.observation.unit)
         mean, error = self.combined
-        sky, sky_error = self.posterior_mean
         images = {
             "COMBINED": (mean, unit),
             "COMBINED_ERROR": (error, unit),
             "THROUGHPUT": (self.throughput, ""),
-            "POSTERIOR_MEAN": (sky, unit),
-            "POSTERIOR_MEAN_ERROR": (sky_error, unit),
+            "POSTERIOR_MEAN": (self.posterior_mean, unit),
+            # It takes a fifth of the time of a first look's products.
+            **(
+                {}
+                if self._is_quick
+                else {"POSTERIOR_MEAN_ERROR": (self.posterior_mean_error, unit)}
+            ),
             "CONTRAST": (self.turned(detection.contrast), ""),
             "CONTRAST_ERROR": (self.turned(detection.error), ""),
             "SNR": (self.turned(detection.snr), ""),
@@ -206,7 +223,7 @@ class Overview:
         mean, error = self.images.combined
         image, title = mean, "Without the star"
         if panel == "most_probable":
-            image, title = self.images.posterior_mean[0], "Most probable image"
+            image, title = self.images.posterior_mean, "Most probable image"
         if panel == "klip" and self.klip is not None:
             image, grid, title = self.klip.image, self.klip.grid, self.klip.label
         drawing.signed_image(
