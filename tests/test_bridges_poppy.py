@@ -152,9 +152,6 @@ def test_several_wavelengths_with_weights():
     truth = system.calc_psf(waves, weight=weights)
     model = from_poppy(system, waves, weights)
     assert relative(model.calc_psf()[0].data, truth[0].data) < 1e-12
-    source = {"wavelengths": waves.value, "weights": weights}
-    again = from_poppy(system, WAVELENGTH).calc_psf(source=source)
-    assert relative(again[0].data, truth[0].data) < 1e-12
 
 
 @pytest.mark.parametrize("normalize", ["last", "exit_pupil"])

@@ -23,7 +23,7 @@ from pyklip_diffrender.detection.published_limits import published_limits
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument import FILTERS, detector_place
 from pyklip_diffrender.instrument.spectrum import vega_flux_density
-from pyklip_diffrender.refinement import jansky_per_unit, require_calibrated, to_jansky
+from pyklip_diffrender.refinement import jansky_per_unit, require_calibrated
 from pyklip_diffrender.scene import Observation, world_coordinates
 
 # Of jw01184005001_03106_00001_nrcalong_calints.fits. The linear part of its WCS is the pipeline's,
@@ -363,17 +363,6 @@ def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path):
     assert jansky_per_unit(fitted(got)) is None
     with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
         require_calibrated(got)
-
-
-@pytest.mark.parametrize("star", [0.36308, "363.08 mJy", 363.08 * u.mJy, 10.0 * u.ABmag])
-def test_the_stars_flux_may_be_given_in_any_unit(star):
-    assert to_jansky(star) == pytest.approx(0.36308, rel=1e-4)
-
-
-@pytest.mark.parametrize("star", [0, math.nan, "bright", 3 * u.m, None, [0.1, 0.2]])
-def test_what_is_no_flux_is_refused(star):
-    with pytest.raises(IncompatibleSetupError, match=r"star_flux: got .* expected (a flux|1e-06)"):
-        to_jansky(star)
 
 
 def test_the_epoch_is_the_middle_of_the_exposures(tmp_path):
