@@ -6,10 +6,7 @@ Plain ``pytest`` leaves out what is marked ``slow`` and tries few examples in ea
 
 import importlib.util
 import os
-import signal
-import subprocess
 import sys
-import textwrap
 import warnings
 from pathlib import Path
 
@@ -159,19 +156,3 @@ def registered():
     register(opd=OPD, subtractor=render)
     yield
     unregister()
-
-
-@pytest.fixture
-def killed():
-    """Runs a program with a path, and kills it as soon as it prints a line."""
-
-    def run(program, path):
-        with subprocess.Popen(
-            [sys.executable, "-c", textwrap.dedent(program), str(path)],
-            stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        ) as process:
-            assert process.stdout.readline() == b"writing\n"
-            process.send_signal(signal.SIGKILL)
-
-    return run

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from astropy.io import fits
-from small_world import header_of, small_model
+from small_world import header_of
 from test_spaceklip import KEY, StandIn, concatenation
 
 import pyklip_diffrender as dr
@@ -36,7 +36,7 @@ from pyklip_diffrender.wavefront import random_opd
 pytestmark = pytest.mark.usefixtures("offline")
 
 SIZE = 36
-OPD = 0.1 * random_opd(1, npix=64).data
+OPD = 0.1 * random_opd(1, npix=128).data
 """Metres; so small that the star is as symmetric as real ones."""
 FLUX = 5e8
 """Of the star, in MJy/sr and pixels: about 150 MJy/sr at the brightest pixel."""
@@ -45,7 +45,13 @@ PLANET = (4e-5, 0.9, 120.0)
 ROLLS = ((70.0, (88.7, 91.3)), (80.0, (87.9, 91.6)))
 """Roll angle, and x, y of the star: so near to each other that the rolls are cut alike, and so far
 that each alone is cut elsewhere."""
-SETTINGS = {"cycles": 3.0, "max_iterations": 15, "max_companions": 0, "response_npix": 64}
+SETTINGS = {"cycles": 3.0, "max_iterations": 15, "max_companions": 0, "response_npix": 128}
+
+
+def small_model(observation, size=None, **options):
+    """Make a model of one wavelength, that in the name of the filter."""
+    wavelength = int(str(observation.filter)[1:4]) * 1e-8
+    return model_for(observation, size, monochromatic=wavelength, npix=128, **options)
 
 
 @pytest.fixture(autouse=True)
@@ -63,8 +69,7 @@ def light():
     ones = np.ones((SIDE, SIDE))
     header = header_of("F444W")
     blank = Observation.from_arrays(ones, ones, pixelscale=0.0624, filter="F444W", header=header)
-    # More samples than those of the fits, or images in whole frames would repeat.
-    model = model_for(blank, monochromatic=4.44e-6, npix=128)
+    model = small_model(blank)
 
     def image(roll, center):
         contrast, separation, angle = PLANET
