@@ -68,16 +68,6 @@ def pytest_collection_modifyitems(config, items):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _torch_threads():
-    """One thread per xdist worker: more would only make the workers wait for each other."""
-    before = torch.get_num_threads()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.fixture(scope="session", autouse=True)
 def _forward_mode():
     """Torch's own deprecation warning, at its first forward-mode derivative, is behind us.
 
