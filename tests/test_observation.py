@@ -159,7 +159,7 @@ def test_data_that_are_no_frames_are_refused(shape):
         ({"pixelscale": (0.06, 0.06, 0.06)}, ShapeError, "pixelscale"),
         ({"unit": "parsnips"}, UnitError, "parsnips"),
         *(({"pixelscale": each}, DiffrenderError, "pixelscale") for each in (np.nan, 0.0, np.inf)),
-        ({"valid": np.zeros((2, 8, 10), dtype=bool)}, NoValidPixelsError, "no pixel"),
+        ({"valid": np.zeros((2, 8, 10), dtype=bool)}, NoValidPixelsError, "all 80 pixels"),
     ],
 )
 def test_arrays_that_do_not_go_together_are_refused(frames, arguments, refusal, words):
