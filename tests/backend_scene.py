@@ -6,7 +6,8 @@ from astropy.io import fits
 from pyklip.parallelized import klip_dataset
 
 from pyklip_diffrender.pyklip_backend import Fit, Subtraction
-from pyklip_diffrender.wavefront import as_opd_map
+from pyklip_diffrender.refinement import FitSettings
+from pyklip_diffrender.wavefront import as_opd_map, random_drift, random_opd
 
 SHAPE = (48, 44)
 CENTER = (21.25, 24.5)
@@ -14,6 +15,14 @@ RIPPLE = 2e-9 * np.hypot(*np.mgrid[-32:32, -32:32])
 OPD = as_opd_map(RIPPLE)
 BACKGROUND = 3.0
 ANGLES = (0.0, 20.0, 45.0)
+
+NUMERICS = {"npix": 128, "occulter_sampling": 2.0, "monochromatic": 4.44e-6}
+"""Of models that are fitted."""
+
+OLD = random_opd(1, npix=128)
+NEW = OLD.data + random_drift(2, 40.0, npix=128).data
+FLUX, SKY = 1e10, 100.0
+LINEAR = FitSettings(free=("flux", "background"), wavefront=False)
 
 
 def in_place_of_fits(monkeypatch, subtract):

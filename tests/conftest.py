@@ -6,10 +6,7 @@ Plain ``pytest`` leaves out what is marked ``slow`` and tries few examples in ea
 
 import importlib.util
 import os
-import signal
-import subprocess
 import sys
-import textwrap
 import warnings
 from pathlib import Path
 
@@ -68,16 +65,6 @@ def pytest_collection_modifyitems(config, items):
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _torch_threads():
-    """One thread per xdist worker: more would only make the workers wait for each other."""
-    before = torch.get_num_threads()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -159,19 +146,3 @@ def registered():
     register(opd=OPD, subtractor=render)
     yield
     unregister()
-
-
-@pytest.fixture
-def killed():
-    """Runs a program with a path, and kills it as soon as it prints a line."""
-
-    def run(program, path):
-        with subprocess.Popen(
-            [sys.executable, "-c", textwrap.dedent(program), str(path)],
-            stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        ) as process:
-            assert process.stdout.readline() == b"writing\n"
-            process.send_signal(signal.SIGKILL)
-
-    return run

@@ -372,6 +372,11 @@ def through_a_survey(request, folder):
     if len(failed):
         raise Refused("\n".join(failed["message"]))
     plain = table["injected_contrast"].mask
+    for row in table[~plain]:
+        away = row["recovered_contrast"] - row["injected_contrast"]
+        assert row["recovered"]
+        assert abs(away) < 3 * row["recovered_error"]
+        assert not (folder / "jobs" / row["folder"] / "fit.fits").exists()
     searches, summaries = _products(folder / "jobs" / name for name in table["folder"][plain])
     for each in summaries:
         each["injections"] = np.sum(~plain)  # These are jobs of their own.

@@ -2,8 +2,6 @@
 
 from html.parser import HTMLParser
 
-__all__ = ["HOSTILE", "Tags", "configuration", "inputs", "result", "stub"]
-
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>'
 
 

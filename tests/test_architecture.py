@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections import Counter
 from contextlib import suppress
+from graphlib import CycleError, TopologicalSorter
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -84,7 +85,11 @@ def violations(sources):
                 found.append(f"{path}:{line}: {other} comes after {package}")
             elif other == package:
                 imports[name] |= {_module_of(rest, modules)} - {name, ""}
-    return found + [f"a circle of imports: {' -> '.join(each)}" for each in _circles(imports)]
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        found.append(f"a circle of imports: {' -> '.join(error.args[1])}")
+    return found
 
 
 def _module_of(name, modules):
@@ -95,23 +100,6 @@ def _module_of(name, modules):
                 return candidate
         name = name.rpartition(".")[0]
     return ""
-
-
-def _circles(imports):
-    """Circles in a graph of imports, each once, by depth-first search."""
-    circles, finished = [], set()
-
-    def visit(name, trail):
-        if name in trail:
-            circles.append([*trail[trail.index(name) :], name])
-        elif name not in finished:
-            for other in sorted(imports[name]):
-                visit(other, [*trail, name])
-            finished.add(name)
-
-    for name in sorted(imports):
-        visit(name, [])
-    return circles
 
 
 def loaded_by(code):

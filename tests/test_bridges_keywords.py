@@ -68,17 +68,13 @@ STPSF = {
 """Arguments of a call in which a keyword of stpsf's `Instrument.calc_psf` acts."""
 
 STPSF_REFUSED = {"save_intermediates": POPPY_REFUSED["save_intermediates"]}
-PLAIN_REFUSED = {
-    "save_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
-    "return_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
-    "return_final": (True, r"debug\(opd\) returns the field at every plane"),
-    "display_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
-    "progressbar": POPPY_REFUSED["progressbar"],
-    "inwave": POPPY_REFUSED["inwave"],
-}
+FIELDS = (True, r"debug\(opd\) returns the field at every plane")
+PLAIN_REFUSED = POPPY_REFUSED | dict.fromkeys(
+    ("save_intermediates", "return_intermediates", "return_final", "display_intermediates"), FIELDS
+)
 OWN_REFUSED = {
-    "save_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
-    "return_intermediates": (True, r"debug\(opd\) returns the field at every plane"),
+    "save_intermediates": FIELDS,
+    "return_intermediates": FIELDS,
     "add_distortion": (True, "modelled by from_webbpsf only"),
 }
 
@@ -233,6 +229,7 @@ def test_keywords_of_stpsf_act_on_the_embedded_instrument(tmp_path, keyword):
     if "outfile" in call:
         with fits.open(tmp_path / "psf.fits") as written:
             same(written, psf, 0)
+            assert written[0].header["FILENAME"] == "psf.fits"
         with pytest.raises(FileExistsError, match="overwrite"):
             model.calc_psf(**{**call, "overwrite": False})
     if keyword == "display":

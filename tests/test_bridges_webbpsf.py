@@ -74,30 +74,6 @@ def test_keywords_and_extensions_are_those_of_stpsf(nircam):
         assert mine.header["DRPROP"] == "MASK335R: compact"
 
 
-@pytest.mark.slow
-def test_a_script_for_stpsf_runs_unchanged(nircam, tmp_path):
-    instrument = nircam()
-    model = from_webbpsf(instrument)
-    path = str(tmp_path / "psf.fits")
-    call = {"monochromatic": 4.2e-6, "fov_pixels": 40, "oversample": 2}
-    truth, psf = instrument.calc_psf(**call), model.calc_psf(outfile=path, **call)
-    with fits.open(path) as written:
-        for k in range(4):
-            assert error(psf[k].data, truth[k].data) < 1e-10
-            assert np.array_equal(written[k].data, psf[k].data)
-    with pytest.raises(FileExistsError, match="overwrite"):
-        model.calc_psf(outfile=path, overwrite=False, **call)
-    arcsec = {"monochromatic": 4.2e-6, "fov_arcsec": 1.6, "fft_oversample": 2}
-    one = {"detector_oversample": 1, "add_distortion": False, "normalize": "last"}
-    (_, truth), (_, psf) = (each.calc_psf(**arcsec, **one) for each in (instrument, model))
-    assert error(psf.data, truth.data) < 1e-10
-    psf, waves = model.calc_psf(**arcsec, detector_oversample=1, return_intermediates=True)
-    assert len(waves) == 6
-    assert waves[-1].shape == psf[0].data.shape
-    with pytest.raises(errors.IncompatibleSetupError, match="not all three"):
-        model.calc_psf(oversample=2, fft_oversample=2, detector_oversample=2)
-
-
 def test_the_users_object_and_the_model_do_not_touch_each_other(nircam):
     instrument = nircam(source_offset_x=0.05)
     settings = copy.deepcopy(instrument.options)
@@ -227,6 +203,10 @@ def test_what_cannot_be_converted(nircam):
         from_webbpsf(nircam(), monochromatic=2e-6)
     with pytest.warns(errors.DiffrenderWarning, match=r"3\.5e-06 m is outside F444W"):
         from_webbpsf(nircam(), **{**FAST, "monochromatic": 3.5 * u.um})
+    with pytest.raises(errors.IncompatibleSetupError, match="not all three"):
+        from_webbpsf(nircam(), **FAST).calc_psf(
+            oversample=2, fft_oversample=2, detector_oversample=2
+        )
 
 
 @pytest.mark.parametrize(

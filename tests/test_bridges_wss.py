@@ -18,7 +18,6 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.optics import resample
 from pyklip_diffrender.wavefront import read_opd
-from pyklip_diffrender.wavefront.wss import interpolate_wss
 
 NPIX = 256
 FIRST, SECOND = (f"R2022081102-NRCA3_FP1-{k}.fits" for k in (1, 2))
@@ -86,18 +85,6 @@ def test_read_opd_recognises_the_file_by_its_content(stpsf_path, wss, tmp_path, 
     inside = resample(pupil(NPIX), 1024) == 1
     assert np.corrcoef(summed.data[inside], resample(coarse, 1024)[inside])[0, 1] > 0.99
     assert np.corrcoef(summed.data[inside], resample(coarse[::-1], 1024)[inside])[0, 1] < 0.9
-
-
-def test_interpolation_in_time_warns(wss, tmp_path):
-    later = tmp_path / LATER
-    wss_file(later, seed=6, date="2022-08-14T02:00:00")
-    maps = [load_wss_opd(path, npix=NPIX, backout_si_wfe=False) for path in (wss, later)]
-    with pytest.warns(DiffrenderWarning, match=r"interpolation, 67% of R2022081102"):
-        between = interpolate_wss(*maps, "2022-08-12T02:00:00")
-    assert np.allclose(between.data, (2 * maps[0].data + maps[1].data) / 3, atol=1e-15)
-    assert between.date == Time("2022-08-12T02:00:00")
-    with pytest.raises(IncompatibleSetupError, match="not between"):
-        interpolate_wss(*maps, "2022-08-15")
 
 
 ROWS = [

@@ -314,13 +314,9 @@ def plain(text):
     return " ".join(text.split())
 
 
-def powers(text):
-    """Exponents as people write them: 5e-7 for 5e-07."""
-    return re.sub(r"e-0(\d)", r"e-\1", text)
-
-
 def as_stated(phrase, numbers):
-    return plain(powers(phrase.format(*numbers)))
+    # Exponents as people write them: 5e-7 for 5e-07.
+    return plain(re.sub(r"e-0(\d)", r"e-\1", phrase.format(*numbers)))
 
 
 @cache

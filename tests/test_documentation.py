@@ -62,18 +62,12 @@ class Block:
 def blocks():
     found = []
     for path in PAGES:
-        page = path.relative_to(ROOT).as_posix()
-        language, start, lines = None, 0, []
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            fence = re.match(r"(```+|:::+)(.*)", line)
-            if language is None and fence and fence[1].startswith("`"):
-                language, start, lines = fence[2].strip(), number + 1, []
-            elif language is not None and line.strip() == "```":
-                found.append(Block(page, start, language, "\n".join(lines)))
-                language = None
-            elif language is not None:
-                lines.append(line)
-        assert language is None, f"{page}:{start}: the block does not end"
+        page, text = path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+        fenced = re.compile(r"^```+(.*)\n((?:.*\n)*?)[ \t]*```[ \t]*$", re.MULTILINE)
+        assert not re.search("^```", fenced.sub("", text), re.MULTILINE), f"{page}: a block is open"
+        for each in fenced.finditer(text):
+            line = text.count("\n", 0, each.start(2)) + 1
+            found.append(Block(page, line, each[1].strip(), each[2].removesuffix("\n")))
     return tuple(found)
 
 

@@ -5,6 +5,8 @@ import json
 import math
 import os
 import re
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -192,21 +194,25 @@ def test_a_failure_while_writing_leaves_the_old_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+HALF_WRITTEN = """
+import sys, time
+from pyklip_diffrender.io.files import replacing
+with replacing(sys.argv[1]) as temporary:
+    temporary.write_bytes(b"half")
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
 @pytest.mark.hard
-def test_a_process_killed_while_writing_leaves_the_old_product_intact(tmp_path, killed):
+def test_a_process_killed_while_writing_leaves_the_old_product_intact(tmp_path):
     path = written(tmp_path / "product.fits")
     before = io.sha256(path)
-    killed(
-        """
-        import sys, time
-        from pyklip_diffrender.io.files import replacing
-        with replacing(sys.argv[1]) as temporary:
-            temporary.write_bytes(b"half")
-            print("writing", flush=True)
-            time.sleep(60)
-        """,
-        path,
-    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", HALF_WRITTEN, str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
+        assert process.stdout.readline() == b"writing\n"
+        process.kill()
     assert io.sha256(path) == before
 
 

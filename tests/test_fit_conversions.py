@@ -1,77 +1,53 @@
 """Frames that `calc_psf` of the real stpsf and poppy made, fitted with converted models."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import poppy
 import pytest
 from astropy import units as u
 from astropy.io import fits
-from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 
 import pyklip_diffrender as dr
+from benchmarks.noisy_stars import READ_NOISE, observed
 from benchmarks.stpsf_data import lopsided
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf
 from pyklip_diffrender.instrument import maskrnd_openings
-from pyklip_diffrender.optics import OpticalSystem, PupilGrid, polygon_coverage
+from pyklip_diffrender.optics import PupilGrid, polygon_coverage
 from pyklip_diffrender.refinement import FitSettings, Status
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront import FourierModes
 
-Array = NDArray[np.float64]
 
-READ_NOISE = 20.0
+def check(model, before, later, images, planet, flux, seen, settings, seed=5):
+    """The drift is recovered, and the planet measured.
 
+    `images` are those of the star and of the planet's place by the other code, with the `later`
+    wavefront; `seen` is where light passes the stop.
+    """
+    star, light = images
+    truth, design = flux * star, np.stack([np.ones(seen.sum()), *np.nonzero(seen)], axis=1)
 
-@dataclass
-class World:
-    """A converted model of an earlier wavefront, and what the other code shows later."""
-
-    model: OpticalSystem
-    before: Array  # (npix, npix), wavefronts, m
-    later: Array
-    star: Array  # (ny, nx), images of the star and of the planet's place, by the other code, later
-    light: Array
-    planet: Planet
-    flux: float
-    seen: Array  # (npix, npix), where light passes the stop
-
-    def observed(self, seed):
-        """A frame with photon and read noise."""
-        rng = np.random.default_rng(seed)
-        expected = self.flux * (self.star + self.planet.contrast * self.light)
-        data = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
-        error = np.sqrt(np.maximum(data, 0) + READ_NOISE**2)
-        return Observation.from_arrays(data, error, pixelscale=self.model.detector.pixelscale)
-
-    def error_of(self, star):
+    def error_of(image):
         """Rms of a star model's error over the noise."""
-        truth = self.flux * self.star
-        return float(np.sqrt(np.mean((star - truth) ** 2 / (truth + READ_NOISE**2))))
+        return float(np.sqrt(np.mean((image - truth) ** 2 / (truth + READ_NOISE**2))))
 
-    def unseen_rms(self, opd):
+    def unseen_rms(opd):
         """Rms of a wavefront's error behind the stop, piston and tilt apart, m."""
-        y, x = np.nonzero(self.seen)
-        design = np.stack([np.ones(len(x)), x, y], axis=1)
-        away = (opd - self.later)[self.seen]
+        away = (opd - later)[seen]
         return float(np.std(away - design @ np.linalg.lstsq(design, away, rcond=None)[0]))
 
-
-def check(world, settings, seed=5):
-    """The drift is recovered, and the planet measured."""
-    fit = dr.refine(world.model, world.observed(seed), world.before, settings=settings)
+    frame = observed(truth + flux * planet.contrast * light, seed, model.detector.pixelscale)
+    fit = dr.refine(model, frame, before, settings=settings)
     assert fit.status is Status.CONVERGED
-    outdated = world.error_of(world.flux * world.model(world.before).numpy())
+    outdated = error_of(flux * model(before).numpy())
     assert outdated > 3
-    star = fit.frames[0].star - fit.frames[0].values["background"][0]
-    assert world.error_of(star) < 0.15 * outdated
-    assert world.unseen_rms(fit.wavefront) < 0.5 * world.unseen_rms(world.before)
+    assert error_of(fit.frames[0].star - fit.frames[0].values["background"][0]) < 0.15 * outdated
+    assert unseen_rms(fit.wavefront) < 0.5 * unseen_rms(before)
     (row,) = dr.detect(fit).candidates
-    away = abs(float(row["contrast"]) - world.planet.contrast)
+    away = abs(float(row["contrast"]) - planet.contrast)
     assert away < 3 * row["contrast_error"]
-    assert away < 0.1 * world.planet.contrast
-    for axis, true in zip("xy", world.planet.offset, strict=True):
+    assert away < 0.1 * planet.contrast
+    for axis, true in zip("xy", planet.offset, strict=True):
         assert abs(row[axis].value - true) < 3 * row[f"{axis}_error"].value
 
 
@@ -102,18 +78,17 @@ def test_a_frame_made_by_stpsf(stpsf_path):
         drifted = fits.HDUList([fits.PrimaryHDU(opd, hdus[0].header)])
     planet = Planet(3e-5, 0.7, 60.0)
     offset = dict(zip(("source_offset_x", "source_offset_y"), planet.offset, strict=True))
-    star, light = (
+    images = (
         nircam(stpsf_path, npix, drifted, **options).calc_psf(**call)["DET_DIST"].data
         for options in ({}, offset)
     )
     model = from_webbpsf(nircam(stpsf_path, npix), add_distortion=True, **call)
     later = from_webbpsf(nircam(stpsf_path, npix, drifted), **call).entrance.opd
     stop = polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy() > 0.5
-    world = World(
-        model, model.entrance.opd.numpy(), later.numpy(), star, light, planet, 3e10,
-        stop & (model.entrance.lit.numpy()),
+    check(
+        model, model.entrance.opd.numpy(), later.numpy(), images, planet, 3e10,
+        stop & model.entrance.lit.numpy(), FitSettings(cycles=8.0, response_npix=64), seed=8,
     )  # fmt: skip
-    check(world, FitSettings(cycles=8.0, response_npix=64), seed=8)
 
 
 DIAMETER = 2.4
@@ -156,13 +131,13 @@ def test_a_frame_made_by_poppy():
     later = before + lopsided(2 * npix, 2, 10e-9)[:npix, :npix]
     planet = Planet(1e-4, 0.7, 130.0)
     model = from_poppy(coronagraph(before), wave)
-    star, light = (
+    images = (
         np.asarray(coronagraph(later, source).calc_psf(wave * u.m)[0].data, dtype=float)
         for source in (None, planet)
     )
-    world = World(model, before, later, star, light, planet, 5e8, stop_of(npix))
     free = ("star_offset", "flux", "background")
-    check(world, FitSettings(basis=FourierModes(5.0), free=free, response_npix=npix))
+    settings = FitSettings(basis=FourierModes(5.0), free=free, response_npix=npix)
+    check(model, before, later, images, planet, 5e8, stop_of(npix), settings)
 
 
 def test_the_segments_of_jwst_are_no_modes_of_another_telescope():

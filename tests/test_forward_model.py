@@ -7,7 +7,7 @@ import pytest
 import torch
 from astropy.io import fits
 from backend_scene import ANGLES as THREE
-from backend_scene import OPD, frames, generic, render
+from backend_scene import FLUX, LINEAR, NEW, NUMERICS, OLD, OPD, SKY, frames, generic, render
 from pyklip import fm
 from pyklip.fmlib.fmpsf import FMPlanetPSF
 from pyklip.fmlib.nofm import NoFM
@@ -21,7 +21,7 @@ from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, register, unregister
 from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.scene import Planet
-from pyklip_diffrender.wavefront import default_basis, random_drift, random_opd
+from pyklip_diffrender.wavefront import default_basis
 
 # Of pyKLIP's spline through the user's PSF.
 pytestmark = pytest.mark.filterwarnings("ignore:.*rank deficient:UserWarning")
@@ -29,12 +29,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*rank deficient:UserWarning")
 PIXEL, SIDE, STAMP = 0.062424185, 40, 17
 ANGLES, CENTER = (15.0, 85.0), np.array([19.8, 19.4])
 MODES = np.array([1, 3])
-FLUX, SKY = 1e10, 100.0
 SEPARATION, PA, CONTRAST = 11.3, 25.0, 1e-6
-NUMERICS = {"npix": 128, "occulter_sampling": 2.0, "monochromatic": 4.44e-6}
-OLD = random_opd(1, npix=128)
-NEW = OLD.data + random_drift(2, 40.0, npix=128).data
-LINEAR = FitSettings(free=("flux", "background"), wavefront=False)
 
 
 @pytest.fixture(scope="module")

@@ -29,14 +29,9 @@ def model():
     return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
 
 
-@cache
-def opd(seed):
-    return np.asarray(dr.wavefront.random_opd(seed, npix=NPIX).data)
-
-
 def frame(seed, angle, shift=(0.0, 0.0)):
     """A frame whose star is `shift` arcsec off the middle, and its perfect fit."""
-    wavefront = opd(1)
+    wavefront = dr.wavefront.random_opd(1, npix=NPIX).data
     moved = torch.tensor(shift, dtype=torch.float64)
     with torch.no_grad():
         star = FLUX * model()(wavefront, detector_shift=moved).double().numpy()

@@ -582,13 +582,3 @@ def test_pyklip_chooses_as_a_reduction_does(cards, shown, label):
     assert result.pattern == label
     refuted = any("without the library's detector pattern" in each for each in told)
     assert refuted == (bool(cards) and shown == 0)
-
-
-@pytest.mark.slow
-def test_a_reduction_keeps_the_references_that_it_fitted():
-    references = tuple(frame("REF", LIBRARY, seed=k) for k in (3, 4))
-    sequence = dr.ExposureSequence("TARGET", tuple(rolls(LIBRARY)), references)
-    result = dr.reduce(sequence, COARSE, size=24, settings=ALIGNED, pattern="references")
-    assert [len(each.frames) for each in result.references] == [2]
-    assert result.pattern is result.fit.pattern
-    assert "REF" in result.pattern.provenance["stars"]

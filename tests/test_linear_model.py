@@ -10,7 +10,7 @@ from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.linear.model import LinearFrame, LinearModel, Unknown
 
 NY, NX = 6, 7
-SHARED, DRIFT = 6, 2
+SHARED = 6
 
 
 def random(*shape, seed):

@@ -12,6 +12,7 @@ from small_files import AREA, calints
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import (
     CorruptFileError,
+    DiffrenderError,
     DiffrenderWarning,
     IncompatibleSetupError,
     NoValidPixelsError,
@@ -157,6 +158,8 @@ def test_data_that_are_no_frames_are_refused(shape):
         ({"center": np.ones((3, 2))}, ShapeError, r"center.*\(3, 2\)"),
         ({"pixelscale": (0.06, 0.06, 0.06)}, ShapeError, "pixelscale"),
         ({"unit": "parsnips"}, UnitError, "parsnips"),
+        *(({"pixelscale": each}, DiffrenderError, "pixelscale") for each in (np.nan, 0.0, np.inf)),
+        ({"valid": np.zeros((2, 8, 10), dtype=bool)}, NoValidPixelsError, "all 80 pixels"),
     ],
 )
 def test_arrays_that_do_not_go_together_are_refused(frames, arguments, refusal, words):

@@ -13,7 +13,7 @@ from pyklip_diffrender.io import sensing_date
 from pyklip_diffrender.optics import resample
 from pyklip_diffrender.reduction import ReduceOptions, prepare
 from pyklip_diffrender.scene import ExposureSequence, Observation
-from pyklip_diffrender.wavefront import choose_opd, opd_for, random_opd, read_opd
+from pyklip_diffrender.wavefront import choose_opd, interpolate_wss, opd_for, random_opd, read_opd
 
 NPIX = 64
 
@@ -73,6 +73,9 @@ def test_interpolation_is_linear_in_time_at_the_finer_sampling(tmp_path):
     assert opd.date == Time("2022-08-03")
     assert "2.0 days before" in opd.history[-1]
     assert "8.0 days after" in opd.history[-1]
+    maps = [read_opd(path) for path in sorted(tmp_path.iterdir())]
+    with pytest.raises(errors.IncompatibleSetupError, match="not between"):
+        interpolate_wss(*maps, "2022-08-15")
 
 
 @pytest.mark.parametrize(

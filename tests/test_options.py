@@ -112,6 +112,8 @@ def test_no_default_is_repeated():
         ("threshold", float("inf"), "a positive number"), ("threshold", None, "a positive number"),
         ("wide", "no", "'no', expected true or false"), ("max_chi2", 0, "inf for no limit"),
         ("references", "both", "one of joint, pattern, off"), ("star_flux_error", 5, "0.05 for 5"),
+        ("star_flux_error", 0.0, ""), ("star_flux_error", float("nan"), ""),
+        ("injections", -1, "0 or more"), ("injections", 2.5, "0 or more"),
     ],
 )  # fmt: skip
 def test_values_that_are_not_allowed(name, value, words):

@@ -157,12 +157,6 @@ def test_injected_planets_turn_with_the_sky():
     assert first.data.max() == second.data.max() == 1.5
 
 
-@pytest.mark.parametrize("count", [-1, 2.5])
-def test_a_wrong_number_of_planets_is_refused_before_anything_is_read(count):
-    with pytest.raises(IncompatibleSetupError, match="injections"):
-        dr.reduce("no such folder", "no such map", injections=count)
-
-
 @cache
 def star_alone():
     """A star alone, of which the model is exact."""

@@ -224,9 +224,3 @@ def test_a_refinement_survives_the_file(tmp_path):
     again, first = (dr.detect(each).measure(places) for each in (back, fit))
     np.testing.assert_array_equal(again["contrast"], first["contrast"])
     np.testing.assert_array_equal(again["contrast_error"], first["contrast_error"])
-
-
-def test_reduce_says_what_patterns_it_takes():
-    sequence = ExposureSequence("TARGET", (frame("TARGET", 20),))
-    with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'references'"):
-        dr.reduce(sequence, opd(), size=SIZE, pattern="maybe")

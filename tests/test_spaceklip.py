@@ -254,7 +254,6 @@ def test_files_are_judged_before_any_is_fitted(tmp_path):
     confirmation = calints(tmp_path / "ta.fits", observation=3, cards={"EXP_TYPE": "NRC_TACONFIRM"})
     own = calints(tmp_path / "own.fits", observation=4, roll=80.0)
     other = calints(tmp_path / "psf.fits", "HD 2", observation=5)
-    later = calints(tmp_path / "later.fits", observation=6, roll=90.0, date="2023-12-01T06:00:00")
     table = concatenation([*rolls, str(confirmation), str(own), str(other)])
     table["TYPE"] = ["SCI"] * 3 + ["REF"] * 2
     with pytest.warns(DiffrenderWarning) as caught:
@@ -268,11 +267,6 @@ def test_files_are_judged_before_any_is_fitted(tmp_path):
     said = " ".join(str(each.message) for each in caught)
     assert "ta.fits is left out: EXP_TYPE is NRC_TACONFIRM" in said
     assert "own.fits is left out: a reference frame that shows the target itself" in said
-    database = StandIn(tmp_path, {KEY: concatenation([rolls[0], str(later)])})
-    with pytest.raises(ExceptionGroup) as failed:
-        spaceklip.run_obs(database, opd=OPD)
-    assert "2 epochs" in str(failed.value.exceptions[0])
-    assert failed.value.exceptions[0].__notes__ == [f"concatenation {KEY}"]
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from pyklip_diffrender.instrument.spectrum import read_spectrum
 from pyklip_diffrender.io.units import unit_of
 from pyklip_diffrender.refinement import to_jansky
 
+MARK = "\N{ZERO WIDTH NO-BREAK SPACE}"
 MICRON = np.geomspace(1.4, 6.0, 300)
 # A black body of 6000 K, of which a star of 1 Jy at 1.4 micron is made, with h c / k in micron K.
 JANSKY = MICRON**-3.0 / np.expm1(14387.768775 / (MICRON * 6000))
@@ -151,15 +152,18 @@ FILES = {
 
 
 @pytest.mark.parametrize(
-    ("kind", "packed"),
-    [(kind, False) for kind in FILES]
-    + [(kind, True) for kind in ("synphot", "ECSV", "CALSPEC", "VizieR")],
+    ("kind", "dress"),
+    [(kind, "") for kind in FILES]
+    + [(kind, "packed") for kind in ("synphot", "ECSV", "CALSPEC", "VizieR")]
+    + [(kind, "byte-order mark") for kind in ("spaceKLIP's starfile", "SVO", "ECSV", "VizieR")],
 )
-def test_one_star_in_every_format(tmp_path, kind, packed):
+def test_one_star_in_every_format(tmp_path, kind, dress):
     name, write = FILES[kind]
     path = tmp_path / name
     write(path)
-    if packed:
+    if dress == "byte-order mark":
+        path.write_bytes(MARK.encode() + path.read_bytes())
+    if dress == "packed":
         path = path.with_name(f"{name}.gz")
         path.write_bytes(gzip.compress((tmp_path / name).read_bytes()))
     wavelength, flux = read_spectrum(path)
@@ -334,7 +338,8 @@ def test_flux_of_a_star_in_words(star, jansky):
         ("5.3 Vega", "A Vega magnitude is not"), ("6e-14 W/m2/um", "per frequency"),
         ("403 MJY", "such as '0.45 Jy'"), ("bright", "such as '0.45 Jy' or '403 mJy'"),
         (6.5e-14, r"In W / \(m2 um\)"), (0.0, "expected 1e-06"), ("403 MJy", "expected 1e-06"),
-        (np.nan, "expected 1e-06"),
+        (np.nan, "expected 1e-06"), (3 * u.m, "expected a flux"), (None, "expected a flux"),
+        ([0.1, 0.2], "expected a flux"),
     ],
 )  # fmt: skip
 def test_what_is_no_flux_of_a_star_is_refused(star, words):

@@ -1,17 +1,14 @@
-"""FITS files by their suffix, and texts with a byte-order mark, wherever files are read."""
+"""FITS files by their suffix, and configurations with a byte-order mark."""
 
 import gzip
 
 import numpy as np
 import pytest
-from astropy import units as u
 from astropy.io import fits
-from astropy.table import QTable
 from survey_stubs import configuration, inputs
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
-from pyklip_diffrender.instrument.spectrum import read_spectrum
 from pyklip_diffrender.io.files import fits_files, is_fits_name
 from pyklip_diffrender.pattern import PatternLibrary, package_library
 from pyklip_diffrender.scene.admission import exposures_in
@@ -95,41 +92,12 @@ def test_other_files_are_no_fits_files(tmp_path):
     assert all(is_fits_name(f"a{suffix}") for suffix in SUFFIXES)
 
 
-@pytest.mark.parametrize("packed", [".fits.gz", ".fits.fz"])
-def test_a_file_and_its_packed_copy_are_one(tmp_path, packed):
-    copy = renamed(calints(tmp_path / "a_calints.fits"), packed)
+def test_a_file_and_its_packed_copy_are_one(tmp_path):
+    copy = renamed(calints(tmp_path / "a_calints.fits"), ".fits.fz")
     path = calints(tmp_path / "a_calints.fits")
     sequence = dr.ExposureSequence.from_files([path, copy])
     assert len(sequence.science) == 1
     assert "the same file as a_calints" in sequence.excluded[0][1]
-
-
-WAVELENGTH, FLUX = np.arange(1, 7.0), np.array([2, 0.8, 0.4, 0.3, 0.2, 0.1])
-ROWS = ["1 2", "2 0.8", "3 0.4", "4 0.3", "5 0.2", "6 0.1"]
-
-
-def as_votable(path):
-    gigahertz = 299792.458 / WAVELENGTH[::-1] * u.GHz
-    QTable({"sed_freq": gigahertz, "sed_flux": FLUX[::-1] * u.Jy}).write(path, format="votable")
-
-
-@pytest.mark.parametrize(
-    ("name", "write"),
-    [
-        ("star.txt", lambda path: path.write_text("\n".join(["# um Jy", *ROWS]))),
-        ("star.txt", lambda path: path.write_bytes("\r\n".join(ROWS).encode())),
-        ("star.ecsv", lambda path: QTable({"w": WAVELENGTH, "f": FLUX}).write(path)),
-        ("star.vot", as_votable),
-    ],
-    ids=["text", "no comment", "ecsv", "votable"],
-)
-def test_a_spectrum_may_begin_with_a_byte_order_mark(tmp_path, name, write):
-    path = tmp_path / name
-    write(path)
-    path.write_bytes(MARK.encode() + path.read_bytes())
-    wavelength, flux = read_spectrum(path)
-    np.testing.assert_allclose(wavelength, 1e-6 * WAVELENGTH, rtol=1e-6)
-    np.testing.assert_allclose(flux, FLUX)
 
 
 def test_configurations_may_begin_with_a_byte_order_mark(tmp_path):

@@ -376,6 +376,8 @@ def test_references_of_other_epochs_teach_the_pattern_and_not_the_wavefront():
     fitted = [each.observation.name for each in result.fit.frames]
     assert fitted == [each.name for each in (*science(), near)]
     assert result.reference_frames == 4
+    assert [len(each.frames) for each in result.references] == [3]
+    assert result.pattern.provenance["stars"] == ["HD 2"]
     assert "of 4 reference frames 1 in the likelihood, limits " in str(result)
     assert "3 for the detector pattern" in str(result)
     candidate_of(result.detection)

@@ -44,6 +44,7 @@ def model(pixels=48):
     return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=pixels)
 
 
+OPD = dr.wavefront.random_opd(1, npix=128)
 WHOLE, FITTED = 120, 48
 ROLLS = (20.0, 31.0)
 STAR = dr.Star(w2_magnitude=6.5, exposure=1800.0)
@@ -56,10 +57,10 @@ PLANETS = (
 
 def frames_of(planets, *rolls):
     """A whole frame for each roll of a star with planets east of north."""
-    opd, frames = dr.wavefront.random_opd(1, npix=128), []
+    frames = []
     for k, roll in enumerate(rolls):
         seen = tuple(replace(each, position_angle=each.position_angle - roll) for each in planets)
-        frame = dr.simulate(model(WHOLE), dr.Scene(STAR, planets=seen), opd, seed=5 + k)
+        frame = dr.simulate(model(WHOLE), dr.Scene(STAR, planets=seen), OPD, seed=5 + k)
         frames.append(replace(frame, position_angles=np.full(1, roll), name=f"roll{k}.fits"))
     return frames
 
@@ -67,13 +68,13 @@ def frames_of(planets, *rolls):
 @pytest.fixture(scope="module")
 def searched():
     """The search of two rolls of a star with three planets, and the whole frames."""
-    opd, frames = dr.wavefront.random_opd(1, npix=128), frames_of(PLANETS, *ROLLS)
+    frames = frames_of(PLANETS, *ROLLS)
     settings, fitted = dr.FitSettings(cycles=8), model(FITTED)
     cut = [each.cutout(FITTED) for each in frames]
-    fit = dr.refine(fitted, cut, opd, settings=settings)
+    fit = dr.refine(fitted, cut, OPD, settings=settings)
     # As in `reduce`, once more without the light of the sources beyond the fitted pixels.
     cleaned = wide_field(dr.detect(fit), frames).subtracted(frames, cut)
-    detection = dr.detect(dr.refine(fitted, cleaned, opd, settings=settings))
+    detection = dr.detect(dr.refine(fitted, cleaned, OPD, settings=settings))
     return detection, frames, wide_field(detection, frames)
 
 
@@ -97,22 +98,18 @@ def gaussian(contrast, x, y):
 @pytest.fixture(scope="module")
 def crowded():
     """A point source, an extended one, and another one at the lower edge; the star is known."""
-    opd = dr.wavefront.random_opd(1, npix=128)
     planets = (POINT, *gaussian(4e-4, 1.3, 0.2), *gaussian(1e-3, -0.4, -2.4))
-    frame = dr.simulate(model(100), dr.Scene(STAR, planets=planets), opd, seed=5)
+    frame = dr.simulate(model(100), dr.Scene(STAR, planets=planets), OPD, seed=5)
     settings = dr.FitSettings(wavefront=False, companions_if_stalled=False)
-    fit = dr.refine(model(24), frame.cutout(24), opd, settings=settings)
+    fit = dr.refine(model(24), frame.cutout(24), OPD, settings=settings)
     detection = dr.detect(fit, relinearise=False)
     return detection, frame, wide_field(detection, [frame])
 
 
 def run_of(wholes, size, **settings):
-    options, opd = (
-        ReduceOptions(settings=dr.FitSettings(**settings)),
-        dr.wavefront.random_opd(1, npix=128),
-    )
+    options = ReduceOptions(settings=dr.FitSettings(**settings))
     return _Run(
-        prepare(ExposureSequence("HD 1", tuple(wholes)), opd, options, model=model(size)), False
+        prepare(ExposureSequence("HD 1", tuple(wholes)), OPD, options, model=model(size)), False
     )
 
 
@@ -123,12 +120,9 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit(
     whole, size, contrast, separation
 ):
     """The first one's lobes are 27 times the noise, and a fit of the star alone never ends."""
-    source, opd = (
-        dr.Planet(contrast, separation, position_angle=200.0),
-        dr.wavefront.random_opd(1, npix=128),
-    )
+    source = dr.Planet(contrast, separation, position_angle=200.0)
     run, alone = (
-        run_of([dr.simulate(model(whole), dr.Scene(STAR, planets=planets), opd, seed=5)],
+        run_of([dr.simulate(model(whole), dr.Scene(STAR, planets=planets), OPD, seed=5)],
                size, wavefront=False, companions_if_stalled=False)
         for planets in ((source,), ())
     )  # fmt: skip
@@ -141,22 +135,18 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit(
 
 def test_a_frame_in_which_the_image_of_the_pupil_samples_repeats_is_rendered_with_more():
     """That of 64 samples does after 9.0 arcsec, and the frame has 9.7."""
-    whole, source, opd = (
-        156,
-        dr.Planet.from_offset(1e-2, -2.2, 2.1),
-        dr.wavefront.random_opd(1, npix=128),
-    )
-    frame = dr.simulate(model(whole), dr.Scene(STAR, planets=(source,)), opd, seed=5)
+    whole, source = 156, dr.Planet.from_offset(1e-2, -2.2, 2.1)
+    frame = dr.simulate(model(whole), dr.Scene(STAR, planets=(source,)), OPD, seed=5)
     settings = dr.FitSettings(wavefront=False, companions_if_stalled=False, max_iterations=3)
     coarse, cut = model(32).with_fidelity(npix=64), frame.cutout(32)
-    (fit,) = dr.refine(coarse, cut, opd, settings=settings).frames
+    (fit,) = dr.refine(coarse, cut, OPD, settings=settings).frames
     (known,), _ = sources_beyond([fit], [frame], [cut])
     assert known.contrast == pytest.approx(source.contrast, rel=0.1)
     assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05
     star = fit.render(whole, background=False)
     with torch.no_grad():
         # Of the wavefront the fit knows what its samples show.
-        known_opd = resample(resample(opd.data, 64), 128)
+        known_opd = resample(resample(OPD.data, 64), 128)
         expected = fit.flux * model(whole)(known_opd).numpy()
     # The fit has moved the star and the stop a little.
     assert np.linalg.norm(star - expected) < 0.1 * np.linalg.norm(expected)
@@ -185,7 +175,7 @@ def test_of_the_whole_detector_the_field_of_the_mask_is_used(accuracy, caplog):
     sequence = ExposureSequence("HD 1", (frame,), (replace(frame, reference=True),))
     options = ReduceOptions(accuracy=accuracy, wide=True, size=24)
     caplog.set_level("INFO")
-    prepared = prepare(sequence, dr.wavefront.random_opd(1, npix=128), options)
+    prepared = prepare(sequence, OPD, options)
     # As for SUB320 (20.16 arcsec); for all of the detector it would be 2,048.
     assert prepared.model.npix == {"full": 256, "quick": 128}[accuracy]
     (whole,), (reference,) = prepared.whole.science, prepared.whole.references
@@ -291,23 +281,19 @@ def test_a_faint_source_at_the_edges_of_the_fitted_pixels_is_fitted_with_the_sta
 @pytest.mark.parametrize(("whole", "fitted"), [(56, 24), (64, 32)])
 def test_frames_hardly_larger_than_the_fitted_pixels_have_no_sources_at_their_edges(whole, fitted):
     """All of the smaller one is near the star, where no light is that of the background."""
-    frame = dr.simulate(
-        model(whole + 4), dr.Scene(STAR), dr.wavefront.random_opd(1, npix=128), seed=5
-    )
+    frame = dr.simulate(model(whole + 4), dr.Scene(STAR), OPD, seed=5)
     # The star is not in the middle, so that columns and rows that are searched are not fitted.
     frame = frame.within(Window(4, 4, (whole, whole)))
     settings = dr.FitSettings(wavefront=False, companions_if_stalled=False)
-    opd = dr.wavefront.random_opd(1, npix=128)
-    fit = dr.refine(model(fitted), frame.cutout(fitted), opd, settings=settings)
+    fit = dr.refine(model(fitted), frame.cutout(fitted), OPD, settings=settings)
     assert sources_at_edges(fit, [frame]) == []
 
 
 def test_pixels_that_light_from_beyond_blurs_into_are_left_out():
-    opd = dr.wavefront.random_opd(1, npix=128)
-    frame = dr.simulate(model(WHOLE), dr.Scene(STAR), opd, seed=5)
+    frame = dr.simulate(model(WHOLE), dr.Scene(STAR), OPD, seed=5)
     # A source just beyond the fitted pixels, which end at 1.5 arcsec.
     light, of_cutout = (
-        4e6 * model(size)(opd, star_offset=(1.6, 0.3), blur=0.026).numpy()
+        4e6 * model(size)(OPD, star_offset=(1.6, 0.3), blur=0.026).numpy()
         for size in (WHOLE, FITTED)
     )
     whole = replace(frame, data=light[None])
@@ -322,7 +308,7 @@ def test_pixels_that_light_from_beyond_blurs_into_are_left_out():
     larger = cut.within(Window(-4, -4, (FITTED + 8, FITTED + 8)))
     assert (without_blurred_edges(cut, larger).valid == larger.valid).all()
     prepared = prepare(
-        ExposureSequence("HD 1", (whole,)), opd, ReduceOptions(), model=model(FITTED)
+        ExposureSequence("HD 1", (whole,)), OPD, ReduceOptions(), model=model(FITTED)
     )
     assert (prepared.sequence.science[0].valid[0] == ~left_out).all()
 
@@ -475,7 +461,7 @@ def ring(model, opd, position_angle, points=40):
 @cache
 def rolls(brightness):
     """Two rolls of the star, and the light of its ring in them."""
-    actual = dr.wavefront.random_opd(1, npix=128).data + random_drift(3, hours=40, npix=128).data
+    actual = OPD.data + random_drift(3, hours=40, npix=128).data
     frames, rings = [], []
     rng = np.random.default_rng(1)
     for k, roll in enumerate(ANGLES):
@@ -492,7 +478,7 @@ def rolls(brightness):
 
 def star_alone(frames):
     settings = dr.FitSettings(cycles=10, response_npix=64)
-    return dr.refine(model(), frames, dr.wavefront.random_opd(1, npix=128), settings=settings)
+    return dr.refine(model(), frames, OPD, settings=settings)
 
 
 @cache
@@ -546,9 +532,8 @@ def test_a_star_without_a_disk_has_none():
 @cache
 def small_fit():
     """A star without a companion in 24 x 24 pixels."""
-    opd = dr.wavefront.random_opd(1, npix=128)
-    frame = dr.simulate(model(24), dr.Scene(star=HOST), opd, seed=1)
-    return dr.refine(model(24), frame, opd, settings=dr.FitSettings(cycles=4))
+    frame = dr.simulate(model(24), dr.Scene(star=HOST), OPD, seed=1)
+    return dr.refine(model(24), frame, OPD, settings=dr.FitSettings(cycles=4))
 
 
 def test_products_and_refusals(tmp_path):

@@ -136,7 +136,7 @@ def _instrument_and_wavefront() -> list[Breakage]:
         Breakage(
             "map-before", "the rule 'before' takes the last map before the frames",
             "before = max((each for each in maps if each[0] <= when)",
-            "before = min((each for each in maps if each[0] <= when)", "map_choice",
+            "before = min((each for each in maps if each[0] <= when)", "opd_choice",
         ),
         Breakage(
             "map-unit", "maps are converted to metres",
@@ -162,7 +162,7 @@ def _rules_of_a_fit() -> list[Breakage]:
         Breakage(
             "rule-alignment", "the alignment is fitted before the wavefront",
             "skips_alignment = settings.wavefront and (not settings.free or self._is_warm)",
-            "skips_alignment = settings.wavefront", "refinement candidates hard",
+            "skips_alignment = settings.wavefront", "refinement candidates hard/hard_fits",
         ),
         Breakage(
             "rule-companions", "what the wavefront cannot explain gets unknowns of its own",

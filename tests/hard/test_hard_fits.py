@@ -11,7 +11,7 @@ from benchmarks import stability_fits as hard
 from benchmarks.hard_cases import DTYPES, small, threads, wavefront
 from pyklip_diffrender import errors
 from pyklip_diffrender.refinement import Status
-from pyklip_diffrender.scene import Observation, Scene, simulate
+from pyklip_diffrender.scene import Scene, simulate
 from pyklip_diffrender.wavefront import as_opd_map
 
 pytestmark = pytest.mark.hard
@@ -135,20 +135,6 @@ def test_a_frame_of_the_same_instrument_is_taken():
     real = changed(cards, filter="F444W", pixelscale=(0.0620, 0.0628))
     fit, same = (hard.fitted(each, max_iterations=1) for each in (real, hard.observed(hard.star())))
     assert fit.frames[0].star.tobytes() == same.frames[0].star.tobytes()
-
-
-@pytest.mark.parametrize(
-    ("value", "scale", "error", "words"),
-    [
-        (1.0, float("nan"), errors.DiffrenderError, "pixelscale"),
-        (1.0, 0.0, errors.DiffrenderError, "pixelscale"),
-        (1.0, float("inf"), errors.DiffrenderError, "pixelscale"),
-        (np.nan, 0.06, errors.NoValidPixelsError, None),
-    ],
-)
-def test_arrays_that_are_no_frame_are_refused(value, scale, error, words):
-    with pytest.raises(error, match=words):
-        Observation.from_arrays(np.full((4, 4), value), np.ones((4, 4)), pixelscale=scale)
 
 
 def test_a_model_and_a_simulation_read_arrays_as_maps_are_read():
