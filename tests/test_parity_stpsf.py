@@ -179,8 +179,23 @@ def test_the_embedded_transmission_is_that_of_stpsf(stpsf_path, band, aperture):
     assert np.abs(mine - truth).max() <= (1e-14 if ours.stop == "MASKRND" else 1e-8)
 
 
+# Changes that a test with such limits must notice.
+WRONG = (
+    {"flip_si_wfe": False},
+    {"chromatic_reference": None},  # The wedge's tilt is then at another wavelength.
+    {"image_mask": "MASK430R", "pixelscale": 0.062424185},
+    {"defaults": {"lyot_shift": (0.0, 0.002)}},
+)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EMBEDDED)
 def test_the_embedded_coronagraph_is_that_of_the_official_files(official, case):
     """What is left: the outlines of pupil (0.2 %) and stop (0.1 %), and poppy's Zernike circle."""
     assert max(differences(official, case, {})) < EMBEDDED[case][-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", WRONG, ids=str)
+def test_what_is_wrong_in_the_embedded_coronagraph_is_seen(official, wrong):
+    assert max(differences(official, "MASK335R", wrong)) > 0.03
