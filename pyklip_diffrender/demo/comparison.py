@@ -142,11 +142,26 @@ def run_demo(
         "detected": detection.subtracted[0],
         "optimal": frame - star,
     }
-    ny, nx = frame.shape
+    table = _compared(images, planet, faint, noise, model.detector.pixelscale, seconds)
+    table.meta = {"contrast": contrast, "separation": separation, "hours": hours, "seed": seed}
+    return DemoResult(
+        model, scene, observation, measured, true_opd, fit, images, noise, table, detection
+    )
+
+
+def _compared(
+    images: dict[str, Image],
+    planet: Planet,
+    faint: Image,
+    noise: Image,
+    scale: tuple[float, float],
+    seconds: dict[str, float],
+) -> Table:
+    """A row of figures of merit for each image; `faint` is the image of the planet alone."""
+    ny, nx = noise.shape
     center = ((nx - 1) / 2, (ny - 1) / 2)
-    scale = model.detector.pixelscale
     position = (center[0] + planet.offset[0] / scale[0], center[1] + planet.offset[1] / scale[1])
-    radius = separation / scale[0]
+    radius = planet.separation / scale[0]
     rows = [
         (
             name,
@@ -154,7 +169,7 @@ def run_demo(
             throughput(image, faint, noise, position),
             # The residual of the star: the subtracted frame minus noise and planet.
             star_model_error(
-                np.nan_to_num(images["optimal"] - image), np.zeros_like(star), noise, center,
+                np.nan_to_num(images["optimal"] - image), np.zeros_like(noise), noise, center,
                 radius - 1.5, radius + 1.5,
             ),
             seconds[name],
@@ -167,10 +182,7 @@ def run_demo(
     )
     for name, form in zip(table.colnames[1:], (".1f", ".2f", ".2f", ".1f"), strict=True):
         table[name].format = form
-    table.meta = {"contrast": contrast, "separation": separation, "hours": hours, "seed": seed}
-    return DemoResult(
-        model, scene, observation, measured, true_opd, fit, images, noise, table, detection
-    )
+    return table
 
 
 def write_demo(result: DemoResult, folder: Path) -> list[Path]:

@@ -303,22 +303,7 @@ def candidates_table(
     if dated:
         columns.append(("epoch_mjd", numbers("mjd"), None, ".5f", "of the position, UTC"))
     for k, name in enumerate(filters):
-        snr = np.array([each.fluxes.snr[k] for each in sources], dtype=float).reshape(count)
-        error = np.array([each.fluxes.error[k] for each in sources], dtype=float).reshape(count)
-        error = np.where(np.isfinite(error), error, np.nan)
-        snr = np.where(np.isfinite(error), snr, np.nan)
-        columns += [
-            (f"contrast_{name}", snr * error / stars[name], None, ".3e", f"in {name}"),
-            (f"contrast_error_{name}", error / stars[name], None, ".1e",
-             "without errors of the star's flux and of the source's image"),
-            (f"snr_{name}", snr, None, ".1f", f"in {name} alone"),
-        ]  # fmt: skip
-        if jansky:
-            columns += [
-                (f"flux_density_{name}", snr * error, u.Jy, ".3e", f"in {name}"),
-                (f"flux_density_error_{name}", error, u.Jy, ".1e",
-                 "without the calibration's error"),
-            ]  # fmt: skip
+        columns += _fluxes(sources, k, name, stars[name], jansky=jansky)
     known = [each.hypotheses for each in sources if each.hypotheses is not None]
     if len(known) == count > 0:
         columns += [
@@ -337,6 +322,30 @@ def candidates_table(
              "hypothesis of at least 99 %"),
         ]  # fmt: skip
     return add_columns(QTable(), columns)
+
+
+def _fluxes(
+    sources: Sequence[CombinedSource], k: int, name: str, star: float, *, jansky: bool
+) -> list[Column]:
+    """Columns of the fluxes of sources in filter `k`, called `name`, where the star has `star`."""
+    snr, error = (
+        np.array([getattr(each.fluxes, kind)[k] for each in sources], dtype=float)
+        for kind in ("snr", "error")
+    )
+    is_known = np.isfinite(error)
+    snr, error = np.where(is_known, snr, np.nan), np.where(is_known, error, np.nan)
+    columns: list[Column] = [
+        (f"contrast_{name}", snr * error / star, None, ".3e", f"in {name}"),
+        (f"contrast_error_{name}", error / star, None, ".1e",
+         "without errors of the star's flux and of the source's image"),
+        (f"snr_{name}", snr, None, ".1f", f"in {name} alone"),
+    ]  # fmt: skip
+    if jansky:
+        columns += [
+            (f"flux_density_{name}", snr * error, u.Jy, ".3e", f"in {name}"),
+            (f"flux_density_error_{name}", error, u.Jy, ".1e", "without the calibration's error"),
+        ]
+    return columns
 
 
 def sightings_table(sources: Sequence[CombinedSource]) -> QTable:

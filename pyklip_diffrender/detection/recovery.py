@@ -309,15 +309,7 @@ def completeness(
             region = detection.of_other
             is_of_other = region is not None and is_within(region, grid, offsets).any()
             search = searches[int(is_of_other)]
-            light = limit * searches[0].star / search.star
-            detected = np.zeros((len(strengths), len(offsets)), dtype=bool)
-            for start in range(0, len(offsets), _PLANETS_AT_A_TIME):
-                part = offsets[start : start + _PLANETS_AT_A_TIME]
-                changes = search.maps.response(torch.from_numpy(part))
-                for n, (place, change) in enumerate(zip(part, changes, strict=True), start):
-                    for s, strength in enumerate(strengths):
-                        detected[s, n] = search.finds(strength * light * change, place)
-                        bar.update(1)
+            detected = search.found(limit * searches[0].star / search.star, strengths, offsets, bar)
             rows += [
                 (separation, strength * limit, fraction, len(offsets))
                 for strength, fraction in zip(strengths, detected.mean(axis=1), strict=True)
@@ -413,6 +405,20 @@ class _Searched:
             detection.threshold,
             detection.fits[0].frames[0].star_light,
         )
+
+    def found(
+        self, contrast: float, strengths: Sequence[float], offsets: Image, bar: ProgressBar
+    ) -> NDArray[np.bool_]:
+        """Whether planets are found, (strengths, places), of a contrast times their strengths."""
+        detected = np.zeros((len(strengths), len(offsets)), dtype=bool)
+        for start in range(0, len(offsets), _PLANETS_AT_A_TIME):
+            part = offsets[start : start + _PLANETS_AT_A_TIME]
+            changes = self.maps.response(torch.from_numpy(part))
+            for n, (place, change) in enumerate(zip(part, changes, strict=True), start):
+                for s, strength in enumerate(strengths):
+                    detected[s, n] = self.finds(strength * contrast * change, place)
+                    bar.update(1)
+        return detected
 
     def finds(self, change: Image, place: Image) -> bool:
         """Whether the search has a candidate near a place if the numerator changes by an image."""

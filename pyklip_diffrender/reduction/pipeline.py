@@ -328,7 +328,7 @@ class _Run:
     products: Keeper | None = None
 
     def result(self) -> ReductionResult:
-        options, whole = self.preparation.options, self.preparation.whole.science
+        options = self.preparation.options
         self._require_possible_flux()
         choice, fit = fit_with_pattern(
             self.preparation.sequence.science,
@@ -387,14 +387,7 @@ class _Run:
         assert detection is not None
         if options.wide:
             keep()
-            with stage("whole frames"):
-                wide = wide_field(detection, whole)
-            cleaned = wide.subtracted(whole, sequence.science)
-            if cleaned is not None:
-                with stage("star and search without the light of sources beyond the fitted pixels"):
-                    fit, visit, again = self._with_references(self._fit(cleaned, choice), choice)
-                    detection = again or self._search(fit)
-                    wide = wide_field(detection, whole)
+            wide, detection, visit = self._whole_frames(detection, visit, choice)
         has_limits = bool(len(detection.contrast_curve))
         if options.injections and has_limits:
             keep()
@@ -406,6 +399,21 @@ class _Run:
                 fractions = completeness(detection, progress=self.progress)
         self._require_plausible(detection.fits[0])  # It may have been fitted with companions.
         return reduction()
+
+    def _whole_frames(
+        self, detection: Detection, visit: Visit, choice: PatternChoice
+    ) -> tuple[WideField, Detection, Visit]:
+        """Search the whole frames; the star is fitted again without the light of what is there."""
+        whole = self.preparation.whole.science
+        with stage("whole frames"):
+            wide = wide_field(detection, whole)
+        cleaned = wide.subtracted(whole, choice.science)
+        if cleaned is not None:
+            with stage("star and search without the light of sources beyond the fitted pixels"):
+                fit, visit, again = self._with_references(self._fit(cleaned, choice), choice)
+                detection = again or self._search(fit)
+                wide = wide_field(detection, whole)
+        return wide, detection, visit
 
     @cached_property
     def _beyond(self) -> tuple[Planet, ...]:

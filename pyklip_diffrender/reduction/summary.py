@@ -63,17 +63,7 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
         "accuracy": reduction.accuracy,
         "threshold_snr": detection.threshold,
         "oriented": first.position_angles is not None,
-        "status": {
-            "name": fit.status.name,
-            "message": fit.status.message,
-            "advice": advice(
-                fit.status,
-                patterned=reduction.pattern is not None,
-                remark=f"{detection.remark} {reduction.remark}".strip(),
-            ),
-            "usable": fit.status.usable,
-            "calibrated": fit.status.calibrated,
-        },
+        "status": _status(reduction),
         "fit": {
             "reduced_chi2": fit.reduced_chi2,
             "chi2_per_pixel": fit.chi2_per_pixel,
@@ -113,15 +103,36 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
         ],
         "settings": _settings(fit.settings),
         "seconds": sum(each.seconds for each in (fit, *reduction.references)),
-        "versions": {
-            "pyklip_diffrender": __version__,
-            "python": platform.python_version(),
-            **{name: version(name) for name in _STATED_LIBRARIES},
-        },
+        "versions": _versions(),
     }
     summary = {"sentence": sentence(summary), **summary}
     plain: dict[str, Any] = _plain(summary)
     return plain
+
+
+def _status(reduction: ReductionResult) -> dict[str, Any]:
+    """How the fit of the star ended, and what to do about it."""
+    status, detection = reduction.fit.status, reduction.detection
+    return {
+        "name": status.name,
+        "message": status.message,
+        "advice": advice(
+            status,
+            patterned=reduction.pattern is not None,
+            remark=f"{detection.remark} {reduction.remark}".strip(),
+        ),
+        "usable": status.usable,
+        "calibrated": status.calibrated,
+    }
+
+
+def _versions() -> dict[str, str]:
+    """Versions of the package, of Python and of the libraries that results depend on."""
+    return {
+        "pyklip_diffrender": __version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in _STATED_LIBRARIES},
+    }
 
 
 def wavefronts(fit: Refinement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
