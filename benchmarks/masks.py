@@ -30,7 +30,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from benchmarks.stpsf_data import nircam
+from benchmarks.stpsf_data import nircam, stop_of
 
 MASKS = {
     "MASK210R": ("NRCA2_FULL_MASK210R", "F210M", 2.1e-6),
@@ -66,8 +66,9 @@ def error(image: Image, limit: Image) -> float:
 def by_stpsf(name: str) -> list[float]:
     """Times, s, and errors of stpsf for a mask, with 2 and 4 points per lambda/D."""
     aperture, band, wavelength = MASKS[name]
-    instrument = nircam(Path(os.environ["STPSF_PATH"]), aperture.split("_")[2], band=band,
-                        npix=NPIX, aperture=aperture, nd_squares=False)  # fmt: skip
+    mask = aperture.split("_")[2]
+    instrument = nircam(Path(os.environ["STPSF_PATH"]), mask, stop_of(mask), band, NPIX,
+                        aperture=aperture, nd_squares=False)  # fmt: skip
     call = {"monochromatic": wavelength, "detector_oversample": 1, "fov_pixels": SIZE}
     limit = dr.from_webbpsf(instrument, **call, fft_oversample=8, add_distortion=False)().numpy()
     values = []

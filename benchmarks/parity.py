@@ -69,8 +69,10 @@ ROWS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "pupil shift, rotation and source offset": (MOVED, {}),
     "MASK430R": ({"image_mask": "MASK430R"}, {}),
     "MASK210R, F200W": ({"image_mask": "MASK210R", "band": "F200W"}, SHORT),
-    "MASKLWB": ({"image_mask": "MASKLWB"}, {}),
-    "MASKSWB, F200W": ({"image_mask": "MASKSWB", "band": "F200W"}, SHORT),
+    "MASKLWB": ({"image_mask": "MASKLWB", "pupil_mask": "MASKLWB"}, {}),
+    "MASKSWB, F200W": (
+        {"image_mask": "MASKSWB", "pupil_mask": "MASKSWB", "band": "F200W"}, SHORT,
+    ),
 }  # fmt: skip
 """Options of the instrument and arguments of the call."""
 

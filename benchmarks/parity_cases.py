@@ -23,8 +23,14 @@ EMBEDDED = {
     "MASK335R": ("MASK335R", "F444W", {}, {}, 5e-3),
     "MASK430R, module B": ("MASK430R", "F356W", {"aperture": "NRCB5_MASK430R"}, B, 5e-3),
     "MASK210R, module B": ("MASK210R", "F210M", {"aperture": "NRCB1_MASK210R"}, B, 5e-3),
-    "MASKSWB, module B": ("MASKSWB", "F210M", {"aperture": "NRCB3_MASKSWB", **MIDDLE}, B, 0.01),
-    "MASKLWB, module B": ("MASKLWB", "F444W", {"aperture": "NRCB5_MASKLWB", **MIDDLE}, B, 0.01),
+    "MASKSWB, module B": (
+        "MASKSWB", "F210M", {"aperture": "NRCB3_MASKSWB", "pupil_mask": "MASKSWB", **MIDDLE}, B,
+        0.01,
+    ),
+    "MASKLWB, module B": (
+        "MASKLWB", "F444W", {"aperture": "NRCB5_MASKLWB", "pupil_mask": "MASKLWB", **MIDDLE}, B,
+        0.01,
+    ),
     "flight pupil": ("MASK335R", "F444W", {"pupil": "flight"}, {"pupil": "flight"}, 5e-3),
     # Published for stpsf's options; poppy cuts the shifts to 13 and 7 samples.
     "flight alignment": (

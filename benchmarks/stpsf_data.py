@@ -158,15 +158,19 @@ def make_stpsf_data(folder, npix=256):
     return folder
 
 
-def nircam(folder, image_mask="MASK335R", pupil_mask=None, band="F444W", npix=256, pupil="RevW",
-           aperture=None, **options):  # fmt: skip
-    """A configured stpsf.NIRCam; without `pupil_mask`, it has the stop that belongs to the mask."""
+def stop_of(mask):
+    """The Lyot stop that belongs to a mask, as stpsf calls it."""
+    return mask if mask.endswith("WB") else "MASKRND"
+
+
+def nircam(folder, image_mask="MASK335R", pupil_mask="MASKRND", band="F444W", npix=256,
+           pupil="RevW", aperture=None, **options):  # fmt: skip
+    """A configured stpsf.NIRCam."""
     import stpsf
 
     instrument = stpsf.NIRCam()
-    instrument.filter, instrument.image_mask = band, image_mask
-    stop = image_mask if image_mask.endswith("WB") else "MASKRND"
-    instrument.pupil_mask = pupil_mask or stop
+    instrument.filter = band
+    instrument.image_mask, instrument.pupil_mask = image_mask, pupil_mask
     if aperture is not None:
         # stpsf takes the detector from the mask; the other channel sees the mask as well.
         instrument.set_position_from_aperture_name(aperture)

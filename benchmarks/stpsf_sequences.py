@@ -42,7 +42,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
-from benchmarks.stpsf_data import nircam
+from benchmarks.stpsf_data import nircam, stop_of
 from pyklip_diffrender.instrument import detector_place, filter_shift
 from pyklip_diffrender.optics import resample
 from pyklip_diffrender.reduction.klip import klip_curve
@@ -180,8 +180,8 @@ def image(
 
 def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0) -> Path:
     """Write the frames of a case and the map of before; returns the map."""
-    instrument = nircam(Path(os.environ["STPSF_PATH"]), case.mask, band=case.filter, npix=1024,
-                        aperture=case.aperture, nd_squares=False)  # fmt: skip
+    instrument = nircam(Path(os.environ["STPSF_PATH"]), case.mask, stop_of(case.mask), case.filter,
+                        1024, aperture=case.aperture, nd_squares=False)  # fmt: skip
     opd, header = map_of(instrument)
     before = folder / MAP
     hdu = fits.PrimaryHDU(opd, header)
