@@ -20,11 +20,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +31,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 import pyklip_diffrender as dr
+from benchmarks.provenance import provenance
 from pyklip_diffrender.detection import Detection, SkyMap
 from pyklip_diffrender.detection.field import separation_of
 from pyklip_diffrender.optics import PupilGrid
@@ -105,8 +105,7 @@ def main() -> None:
     parser.add_argument("--sequences", type=int, default=12)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    names: list[str] = []
-    rows: list[dict[str, float]] = []
+    rows: list[dict[str, Any]] = []
     kept = options.output.with_suffix(".jsonl")
     known = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     for seed in range(len(known), options.sequences):
@@ -115,25 +114,14 @@ def main() -> None:
             file.write(json.dumps(known[-1]) + "\n")
         print(f"sequence {seed + 1} of {options.sequences}", flush=True)
     for name in SETS:
-        names.append(name)
         parts = [each[name] for each in known[: options.sequences]]
-        rows.append(
-            {"searches": len(parts)}
-            | {key: float(np.mean([each[key] for each in parts])) for key in parts[0]}
-        )
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    table = QTable({"set": names})
-    for column in columns:
-        table[column] = [row.get(column, np.nan) for row in rows]
+        means = {key: float(np.mean([each[key] for each in parts])) for key in parts[0]}
+        rows.append({"set": name, "searches": len(parts)} | means)
+    table = QTable(rows)
+    for column in table.colnames[2:]:
         table[column].info.format = ".3f"
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    table.meta = {
-        "command": f"python -m benchmarks.combined --sequences {options.sequences}",
-        "commit": commit, "date": Time.now().isot[:10], "threshold": LEVEL,
-        "threads": os.environ.get("OMP_NUM_THREADS", "default"),
-    }  # fmt: skip
+    table.meta = provenance(f"benchmarks.combined --sequences {options.sequences}")
+    table.meta["threshold"] = LEVEL
     table.write(options.output, format="ascii.ecsv", overwrite=True)
     table.pprint_all()
 

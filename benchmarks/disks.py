@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from benchmarks.real_options import real_frames_parser
+from benchmarks.real_frames import real_frames_parser
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.drawing import halo, light_norm, save
 from pyklip_diffrender.reduction.klip import KlipSubtraction, klip_curve

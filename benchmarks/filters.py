@@ -22,6 +22,7 @@ import torch
 from astropy.io import fits
 
 import pyklip_diffrender as dr
+from benchmarks.real_frames import DATA, opd_of
 from pyklip_diffrender.reduction import summarise
 
 ROLLS = ("jw01184005001_03106", "jw01184006001_03106")
@@ -76,10 +77,10 @@ def main() -> None:
     """Simulate, reduce, and print what was recovered."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("filters", nargs="+", metavar="FILTER[:MASK]")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--planets", type=int, default=14)
     options = parser.parse_args()
-    sensed = dr.read_opd(options.data / "opd_2022-08-14.fits.gz")
+    sensed = dr.read_opd(opd_of(options.data))
     opd = sensed.data + dr.wavefront.random_opd(5, npix=sensed.data.shape[-1], rms=CHANGE).data
     for name in options.filters:
         filter, _, mask = name.partition(":")

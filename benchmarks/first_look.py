@@ -10,7 +10,6 @@ in units of flux, because contrasts take the star's flux, which a first look mea
 from __future__ import annotations
 
 import argparse
-import datetime
 import time
 import warnings
 from pathlib import Path
@@ -21,7 +20,7 @@ import torch
 from astropy.table import Table
 
 import pyklip_diffrender as dr
-from benchmarks.provenance import processor
+from benchmarks.provenance import provenance
 from pyklip_diffrender.scene import ExposureSequence
 
 Limits = dict[str, Any]
@@ -82,11 +81,7 @@ def main() -> None:
             print(rows[-1], flush=True)
     table = Table(rows)
     table.round({name: 3 for name in table.colnames if table[name].dtype.kind == "f"})
-    table.meta = {
-        "command": "python -m benchmarks.first_look --opd MAP --output FILE CALINTS",
-        "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
-        "machine": f"{processor()}, one thread, torch {torch.__version__}",
-    }
+    table.meta = provenance("benchmarks.first_look --opd MAP --output FILE CALINTS")
     table.write(options.output, overwrite=True)
 
 

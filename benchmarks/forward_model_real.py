@@ -29,7 +29,7 @@ from pyklip.instruments.JWST import JWSTData
 
 import pyklip_diffrender as dr
 from benchmarks.forward_model import STAMP, Errors, Image, Planet, print_statistics
-from benchmarks.real_options import real_frames_parser
+from benchmarks.real_frames import real_frames_parser
 from pyklip_diffrender.refinement import FrameFit
 
 SIDE = 101

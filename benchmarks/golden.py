@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -27,9 +26,10 @@ import numpy as np
 import torch
 from astropy.io import fits
 from astropy.table import QTable
-from astropy.time import Time
 
 import pyklip_diffrender as dr
+from benchmarks.provenance import provenance
+from benchmarks.real_frames import DATA, frames_of, opd_of
 from pyklip_diffrender.cli import main as command_line
 from pyklip_diffrender.detection import Detection
 
@@ -54,16 +54,6 @@ TOLERANCES = {
     "count": (0.0, 0.0),
 }
 """Relative and absolute tolerance by the first word of a number's name."""
-
-
-def opd_of(data: Path, star: str = "") -> Path:
-    return data / ("opd_2022-07-30.fits.gz" if star == "HIP-65426" else "opd_2022-08-14.fits.gz")
-
-
-def frames_of(data: Path, star: str, band: str = "F444W") -> dr.ExposureSequence:
-    if star == "HIP-65426":
-        return dr.ExposureSequence.from_files([data / "hip65426_f444w_calints.fits.gz"])
-    return dr.ExposureSequence.from_files(data / "gto1184", target=star, filter=band)
 
 
 def reduced(
@@ -215,7 +205,7 @@ def main() -> None:
     """Compute all cases, and freeze or compare them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--output", type=Path, help="freeze the numbers")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--case", action="append", choices=tuple(CASES))
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -231,13 +221,7 @@ def main() -> None:
         raise SystemExit(failed)
     table = QTable(rows=rows, names=("case", "number", "value"))
     table["value"].info.format = ".8g"
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    table.meta = {
-        "command": "python -m benchmarks.golden --output docs/results/golden.ecsv",
-        "commit": commit, "date": Time.now().isot[:10],
-    }  # fmt: skip
+    table.meta = provenance("benchmarks.golden --output docs/results/golden.ecsv")
     table.write(options.output, format="ascii.ecsv", overwrite=True)
 
 

@@ -33,7 +33,7 @@ from pyklip.klip import meas_contrast
 from pyklip.parallelized import klip_dataset
 
 import pyklip_diffrender as dr
-from benchmarks.real_options import real_frames_parser
+from benchmarks.real_frames import real_frames_parser
 
 Image = NDArray[np.float64]
 

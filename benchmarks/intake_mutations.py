@@ -100,8 +100,8 @@ def _set(hdus: fits.HDUList, **cards: Any) -> None:
             header[key] = (value, "")  # A comment may not fit beside a long name.
 
 
-def _nothing(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-    del hdus, rng
+def _nothing(_hdus: fits.HDUList, _rng: np.random.Generator) -> None:
+    """Leave a file as it is."""
 
 
 # -- copies and other products ---------------------------------------------------------------------
@@ -117,16 +117,14 @@ def _product(level: str, change: Change) -> Mutation:
     return mutate
 
 
-def _to_rate(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-    del rng
+def _to_rate(hdus: fits.HDUList, _: np.random.Generator) -> None:
     factor = float(_card(hdus, "PHOTMJSR").get("PHOTMJSR", 2.5))
     for key in ("SCI", "ERR"):
         hdus[key].data = hdus[key].data / factor
     _set(hdus, BUNIT="DN/s")
 
 
-def _to_cal(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-    del rng
+def _to_cal(hdus: fits.HDUList, _: np.random.Generator) -> None:
     for key in ("SCI", "ERR", "DQ"):
         hdus[key].data = hdus[key].data[0]
 
@@ -150,8 +148,7 @@ for _level in ("i2d", "psfsub", "psfalign", "psfstack"):
 
 
 @_mutation("gzip beside fits")
-def _packed(folder: Folder, name: str, rng: np.random.Generator) -> None:
-    del rng
+def _packed(folder: Folder, name: str, _: np.random.Generator) -> None:
     path = folder.path / name
     (folder.path / f"{name}.gz").write_bytes(gzip.compress(path.read_bytes(), 1))
     folder.sources[f"{name}.gz"] = folder.sources[name]
@@ -159,8 +156,7 @@ def _packed(folder: Folder, name: str, rng: np.random.Generator) -> None:
 
 
 @_mutation("symlink")
-def _link(folder: Folder, name: str, rng: np.random.Generator) -> None:
-    del rng
+def _link(folder: Folder, name: str, _: np.random.Generator) -> None:
     (folder.path / f"a_{name}").symlink_to(folder.path / name)
     folder.sources[f"a_{name}"] = folder.sources[name]
     folder.doubtful |= {name, f"a_{name}"}
@@ -201,8 +197,7 @@ def _point_source() -> np.ndarray:
 def _with_source(contrast: float, separation: float, angle: float) -> Change:
     """Add a source at a position angle from north, degrees, to every integration."""
 
-    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-        del rng
+    def change(hdus: fits.HDUList, _: np.random.Generator) -> None:
         data, header = hdus["SCI"].data, hdus["SCI"].header
         x, y = (float(_card(hdus, key)[key]) - 1 for key in ("CRPIX1", "CRPIX2"))
         roll = float(header["ROLL_REF"]) + float(header.get("V3I_YANG", 0.0))
@@ -223,10 +218,10 @@ def _with_source(contrast: float, separation: float, angle: float) -> Change:
     return change
 
 
-def _everywhere(change: Change) -> Callable[[Folder, np.random.Generator], None]:
+def _in_all(change: Change) -> Mutation:
     """Change all frames of the target, which must then be used as before."""
 
-    def mutate(folder: Folder, rng: np.random.Generator) -> None:
+    def mutate(folder: Folder, _: str, rng: np.random.Generator) -> None:
         names = sorted(folder.sources)
         with fits.open(folder.path / names[0]) as hdus:
             target = hdus[0].header["TARGPROP"]
@@ -244,11 +239,10 @@ def _everywhere(change: Change) -> Callable[[Folder, np.random.Generator], None]
 
 def _neighbours(count: int, contrasts: tuple[float, float], least: float, most: float) -> Mutation:
     def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
-        del name
         for _ in range(count):
             contrast = float(np.exp(rng.uniform(*np.log(contrasts))))
             place = rng.uniform(least, most), rng.uniform(0.0, 360.0)
-            _everywhere(_with_source(contrast, *place))(folder, rng)
+            _in_all(_with_source(contrast, *place))(folder, name, rng)
 
     return mutate
 
@@ -278,14 +272,6 @@ def _nebula(hdus: fits.HDUList, rng: np.random.Generator) -> None:
     width = rng.uniform(15, 60)
     light = np.exp(-((columns - a) ** 2 + (rows - b) ** 2) / (2 * width**2))
     data += (error * rng.uniform(3, 30) * light).astype(data.dtype)
-
-
-def _in_all(change: Change) -> Mutation:
-    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
-        del name
-        _everywhere(change)(folder, rng)
-
-    return mutate
 
 
 MUTATIONS["300 field stars"] = _in_all(_crowd)
@@ -359,14 +345,20 @@ def _segments(folder: Folder, name: str, rng: np.random.Generator) -> None:
 # -- cards -----------------------------------------------------------------------------------------
 
 
-def _cards(bad: bool = True, /, **cards: Any) -> Mutation:
-    """Cards that make a file unusable, or that say the same in other words, or nothing."""
+def _changed(change: Change, *marks: str) -> Mutation:
+    """Change a file, which then belongs to these sets of the folder."""
 
     def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
-        folder.change(name, lambda hdus, _: _set(hdus, **cards), rng)
-        (folder.bad if bad else folder.doubtful).add(name)
+        folder.change(name, change, rng)
+        for mark in marks:
+            getattr(folder, mark).add(name)
 
     return mutate
+
+
+def _cards(*marks: str, **cards: Any) -> Mutation:
+    """Set cards; without marks, these make the file unusable."""
+    return _changed(lambda hdus, _: _set(hdus, **cards), *(marks or ("bad",)))
 
 
 MUTATIONS["target acquisition"] = _cards(EXP_TYPE="NRC_TACQ")
@@ -374,24 +366,16 @@ MUTATIONS["confirmation image"] = _cards(EXP_TYPE="NRC_TACONFIRM")
 MUTATIONS["background"] = _cards(BKGDTARG=True)
 
 
-def _other_cards(**cards: Any) -> Mutation:
-    """Cards of another set-up or epoch."""
+OTHER = ("doubtful", "other")
+"""Marks of files of another set-up or epoch."""
 
-    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
-        folder.change(name, lambda hdus, _: _set(hdus, **cards), rng)
-        folder.doubtful.add(name)
-        folder.other.add(name)
-
-    return mutate
-
-
-MUTATIONS["another mask"] = _other_cards(
-    CORONMSK="MASKA430R", SUBARRAY="SUB320A430R", APERNAME="NRCA5_MASK430R"
+MUTATIONS["another mask"] = _cards(
+    *OTHER, CORONMSK="MASKA430R", SUBARRAY="SUB320A430R", APERNAME="NRCA5_MASK430R"
 )
-MUTATIONS["another detector"] = _other_cards(DETECTOR="NRCBLONG", MODULE="B")
-MUTATIONS["another stop"] = _other_cards(PUPIL="MASKBAR")
+MUTATIONS["another detector"] = _cards(*OTHER, DETECTOR="NRCBLONG", MODULE="B")
+MUTATIONS["another stop"] = _cards(*OTHER, PUPIL="MASKBAR")
 MUTATIONS["another filter"] = _cards(FILTER="F356W")
-MUTATIONS["another unit"] = _other_cards(BUNIT="DN/s")
+MUTATIONS["another unit"] = _cards(*OTHER, BUNIT="DN/s")
 MUTATIONS["no unit"] = _cards(BUNIT=None)
 MUTATIONS["an unknown unit"] = _cards(BUNIT="parsnips")
 MUTATIONS["no pixel area"] = _cards(PIXAR_A2=None)
@@ -403,8 +387,8 @@ MUTATIONS["angles that do not add up"] = _cards(PA_APER=12.0)
 MUTATIONS["XOFFSET in mas"] = _cards(XOFFSET=20.0, YOFFSET=-10.0)
 MUTATIONS["contradicting masks"] = _cards(CORONMSK="MASKA430R")
 MUTATIONS["text for a number"] = _cards(ROLL_REF="seventy")
-MUTATIONS["another epoch"] = _other_cards(
-    DATE_BEG="2023-12-01T06:00:00", DATE_OBS="2023-12-01", EXPMID=60279.3, EXPSTART=60279.25
+MUTATIONS["another epoch"] = _cards(
+    *OTHER, DATE_BEG="2023-12-01T06:00:00", DATE_OBS="2023-12-01", EXPMID=60279.3, EXPSTART=60279.25
 )
 
 
@@ -432,15 +416,12 @@ for _keys in (
     MUTATIONS[f"without {', '.join(_keys)}"] = _missing(*_keys)
 
 
-MUTATIONS["another spelling of the unit"] = _cards(False, BUNIT="MJy sr-1")
-MUTATIONS["a middle of zero"] = _cards(False, EXPMID=0.0)
-MUTATIONS["SUBSTRT of the full frame"] = _cards(False, SUBSTRT1=1, SUBSTRT2=1)
+MUTATIONS["another spelling of the unit"] = _cards("doubtful", BUNIT="MJy sr-1")
+MUTATIONS["a middle of zero"] = _cards("doubtful", EXPMID=0.0)
+MUTATIONS["SUBSTRT of the full frame"] = _cards("doubtful", SUBSTRT1=1, SUBSTRT2=1)
 
 
-@_mutation("APERNAME of the full frame")
-def _full(folder: Folder, name: str, rng: np.random.Generator) -> None:
-    folder.change(name, lambda hdus, _: _set(hdus, APERNAME="NRCA5_FULL_MASK335R"), rng)
-    folder.doubtful.add(name)
+MUTATIONS["APERNAME of the full frame"] = _cards("doubtful", APERNAME="NRCA5_FULL_MASK335R")
 
 
 @_mutation("a reference with the target's name")
@@ -452,25 +433,15 @@ def _namesake(folder: Folder, name: str, rng: np.random.Generator) -> None:
     folder.doubtful.add(names[-1])
 
 
-@_mutation("CRPIX off by three pixels")
-def _crpix(folder: Folder, name: str, rng: np.random.Generator) -> None:
-    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-        for key in ("CRPIX1", "CRPIX2"):
-            _set(hdus, **{key: round(float(_card(hdus, key)[key]) + rng.uniform(-3, 3), 4)})
+def _crpix(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    for key in ("CRPIX1", "CRPIX2"):
+        _set(hdus, **{key: round(float(_card(hdus, key)[key]) + rng.uniform(-3, 3), 4)})
 
-    folder.change(name, change, rng)
-    folder.doubtful.add(name)
+
+MUTATIONS["CRPIX off by three pixels"] = _changed(_crpix, "doubtful")
 
 
 # -- pixels ----------------------------------------------------------------------------------------
-
-
-def _pixels(change: Change, *, bad: bool) -> Mutation:
-    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
-        folder.change(name, change, rng)
-        (folder.bad if bad else folder.doubtful).add(name)
-
-    return mutate
 
 
 def _peak(hdus: fits.HDUList) -> tuple[int, int]:
@@ -504,8 +475,7 @@ def _flags(hdus: fits.HDUList, rng: np.random.Generator) -> None:
 
 
 def _scaled(factor: float) -> Change:
-    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-        del rng
+    def change(hdus: fits.HDUList, _: np.random.Generator) -> None:
         for key in ("SCI", "ERR"):
             hdus[key].data = hdus[key].data * np.float32(factor)
 
@@ -540,67 +510,53 @@ def _blank(hdus: fits.HDUList, rng: np.random.Generator) -> None:
     )
 
 
-def _negative(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-    del rng
+def _negative(hdus: fits.HDUList, _: np.random.Generator) -> None:
     hdus["SCI"].data = -hdus["SCI"].data
 
 
-def _four(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-    del rng
+def _four(hdus: fits.HDUList, _: np.random.Generator) -> None:
     for key in ("SCI", "ERR", "DQ"):
         hdus[key].data = hdus[key].data[None]
 
 
-def _big_endian(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-    del rng
+def _big_endian(hdus: fits.HDUList, _: np.random.Generator) -> None:
     hdus["SCI"].data = hdus["SCI"].data.astype(">f8")
 
 
-def _zero(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-    del rng
+def _zero(hdus: fits.HDUList, _: np.random.Generator) -> None:
     hdus["SCI"].data = np.zeros_like(hdus["SCI"].data)
 
 
-def _masked(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-    del rng
+def _masked(hdus: fits.HDUList, _: np.random.Generator) -> None:
     hdus["DQ"].data = np.ones_like(hdus["DQ"].data)
 
 
-MUTATIONS["a hole at the peak"] = _pixels(_hole, bad=False)
-MUTATIONS["holes"] = _pixels(_holes, bad=False)
-MUTATIONS["a missed cosmic ray"] = _pixels(_cosmic_ray, bad=False)
-MUTATIONS["flagged pixels"] = _pixels(_flags, bad=False)
+MUTATIONS["a hole at the peak"] = _changed(_hole, "doubtful")
+MUTATIONS["holes"] = _changed(_holes, "doubtful")
+MUTATIONS["a missed cosmic ray"] = _changed(_cosmic_ray, "doubtful")
+MUTATIONS["flagged pixels"] = _changed(_flags, "doubtful")
 for _factor in (1e-3, 1e3):
-    MUTATIONS[f"pixels times {_factor:g}"] = _pixels(_scaled(_factor), bad=True)
+    MUTATIONS[f"pixels times {_factor:g}"] = _changed(_scaled(_factor), "bad")
 
 
-def _unlike_others(change: Change) -> Mutation:
-    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
-        folder.change(name, change, rng)
-        folder.doubtful.add(name)
-        folder.unlike.add(name)
-
-    return mutate
-
-
-MUTATIONS["pixels times 0.4"] = _unlike_others(_scaled(0.4))
-MUTATIONS["pixels times 2.5"] = _unlike_others(_scaled(2.5))
-MUTATIONS["mirrored or turned"] = _unlike_others(_mirrored)
-MUTATIONS["star off the mask"] = _pixels(_moved, bad=True)
-MUTATIONS["errors of another unit"] = _pixels(_errors, bad=True)
-MUTATIONS["negative pixels"] = _pixels(_negative, bad=True)
-MUTATIONS["four dimensions"] = _pixels(_four, bad=True)
-MUTATIONS["double precision"] = _pixels(_big_endian, bad=False)
-MUTATIONS["no star"] = _pixels(_blank, bad=True)
-MUTATIONS["zeros"] = _pixels(_zero, bad=True)
-MUTATIONS["all flagged"] = _pixels(_masked, bad=True)
+MUTATIONS["pixels times 0.4"] = _changed(_scaled(0.4), "doubtful", "unlike")
+MUTATIONS["pixels times 2.5"] = _changed(_scaled(2.5), "doubtful", "unlike")
+MUTATIONS["mirrored or turned"] = _changed(_mirrored, "doubtful", "unlike")
+MUTATIONS["star off the mask"] = _changed(_moved, "bad")
+MUTATIONS["errors of another unit"] = _changed(_errors, "bad")
+MUTATIONS["negative pixels"] = _changed(_negative, "bad")
+MUTATIONS["four dimensions"] = _changed(_four, "bad")
+MUTATIONS["double precision"] = _changed(_big_endian, "doubtful")
+MUTATIONS["no star"] = _changed(_blank, "bad")
+MUTATIONS["zeros"] = _changed(_zero, "bad")
+MUTATIONS["all flagged"] = _changed(_masked, "bad")
 
 
 def _lost(key: str) -> Mutation:
     def remove(hdus: fits.HDUList, _: np.random.Generator) -> None:
         del hdus[key]
 
-    return _pixels(remove, bad=True)
+    return _changed(remove, "bad")
 
 
 MUTATIONS["no SCI"], MUTATIONS["no ERR"] = _lost("SCI"), _lost("ERR")
@@ -615,8 +571,7 @@ def _truncated(folder: Folder, name: str, rng: np.random.Generator) -> None:
 
 
 @_mutation("files that are no frames")
-def _junk(folder: Folder, name: str, rng: np.random.Generator) -> None:
-    del name
+def _junk(folder: Folder, _: str, rng: np.random.Generator) -> None:
     for k, content in enumerate((b"", b"not FITS", rng.bytes(5000))):
         (folder.path / f"junk{k}.fits").write_bytes(content)
         folder.bad.add(f"junk{k}.fits")

@@ -11,7 +11,7 @@ with 2 cells. The error of either is the largest difference from its own limit (
 over the peak of the image, which the mask has made fainter. Times are those of the processor with
 one thread, after a first image that fills caches; of this package, the best of three.
 
-Prints a row for each mask; with ``--own``, without stpsf.
+Prints a row for each mask; with ``--own`` without stpsf.
 """
 
 from __future__ import annotations
@@ -26,9 +26,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from astropy.table import Table
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
+from benchmarks.stpsf_data import nircam, stop_of
 
 MASKS = {
     "MASK210R": ("NRCA2_FULL_MASK210R", "F210M", 2.1e-6),
@@ -61,34 +63,28 @@ def error(image: Image, limit: Image) -> float:
     return float(np.abs(image - limit).max() / limit.max())
 
 
-def stpsf_cells(name: str) -> tuple[list[str], float]:
-    """Times and errors of stpsf for a mask, and its time with 4 points per lambda/D, s."""
-    import stpsf
-
+def by_stpsf(name: str) -> list[float]:
+    """Times, s, and errors of stpsf for a mask, with 2 and 4 points per lambda/D."""
     aperture, band, wavelength = MASKS[name]
     mask = aperture.split("_")[2]
-    nircam = stpsf.NIRCam()
-    nircam.filter, nircam.image_mask = band, mask
-    nircam.pupil_mask = mask if mask.endswith("WB") else "MASKRND"
-    nircam.set_position_from_aperture_name(aperture)
-    nircam.pupil = str(Path(os.environ["STPSF_PATH"]) / f"jwst_pupil_RevW_npix{NPIX}.fits.gz")
-    nircam.options["nd_squares"] = False
+    instrument = nircam(Path(os.environ["STPSF_PATH"]), mask, stop_of(mask), band, NPIX,
+                        aperture=aperture, nd_squares=False)  # fmt: skip
     call = {"monochromatic": wavelength, "detector_oversample": 1, "fov_pixels": SIZE}
-    limit = dr.from_webbpsf(nircam, **call, fft_oversample=8, add_distortion=False)().numpy()
-    cells, seconds = [], np.nan
+    limit = dr.from_webbpsf(instrument, **call, fft_oversample=8, add_distortion=False)().numpy()
+    values = []
     for points in (2, 4):
 
         def calculate(points: int = points) -> Image:
-            psf = nircam.calc_psf(**call, fft_oversample=points, add_distortion=False)
+            psf = instrument.calc_psf(**call, fft_oversample=points, add_distortion=False)
             return np.asarray(psf["DET_SAMP"].data)
 
         image, seconds = timed(calculate)
-        cells += [f"{seconds:.1f}", f"{error(image, limit):.0e}"]
-    return cells, seconds
+        values += [seconds, error(image, limit)]
+    return values
 
 
-def own_cells(name: str) -> tuple[list[str], float]:
-    """Time and error of this package for a mask, and the time, s."""
+def by_package(name: str) -> list[float]:
+    """Time, s, and error of this package for a mask."""
     aperture, band, wavelength = MASKS[name]
     opd = torch.from_numpy(dr.wavefront.random_opd(1, npix=NPIX).data)
     images = {}
@@ -99,7 +95,7 @@ def own_cells(name: str) -> tuple[list[str], float]:
         )  # fmt: skip
         with torch.no_grad():
             images[cells], seconds = timed(lambda model=model: model(opd).numpy(), 4)
-    return [f"{seconds:.3f}", f"{error(images[2], images[8]):.0e}"], seconds
+    return [seconds, error(images[2], images[8])]
 
 
 def main() -> None:
@@ -110,17 +106,18 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
-    columns = ["mask", "this, s", "error"]
+    columns = ["mask", "s", "error"]
     if not options.own:
-        columns += ["stpsf 2, s", "error", "stpsf 4, s", "error", "stpsf 4 / this"]
-        stpsf_cells(options.names[0])  # Fills its caches.
-    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
+        columns += ["stpsf 2, s", "stpsf 2, error", "stpsf 4, s", "stpsf 4, error"]
+        by_stpsf(options.names[0])  # Fills its caches.
+    rows = []
     for name in options.names:
-        cells, seconds = own_cells(name)
-        if not options.own:
-            theirs, longer = stpsf_cells(name)
-            cells += [*theirs, f"{longer / seconds:.0f}"]
-        print(f"| {' | '.join([name, *cells])} |", flush=True)
+        rows.append((name, *by_package(name), *([] if options.own else by_stpsf(name))))
+        print(*rows[-1], flush=True)
+    table = Table(rows=rows, names=columns)
+    for column in columns[1:]:
+        table[column].format = ".2g"
+    table.pprint_all()
 
 
 if __name__ == "__main__":

@@ -242,7 +242,7 @@ def main() -> None:
             rows.append(row)
             names = list(dict.fromkeys(name for row in rows for name in row))
             table = Table(rows=[{name: row.get(name, np.nan) for name in names} for row in rows])
-            table.meta = {"provenance": provenance("-m benchmarks.neighbours FRAMES MAP")}
+            table.meta = provenance("benchmarks.neighbours FRAMES MAP")
             write_table(table, options.output)
 
 

@@ -90,15 +90,13 @@ def main() -> None:
     """Search all scenes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=200)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--processes", type=int, default=1)
     options = parser.parse_args()
     counts: Counter[str] = Counter()
     pulls = []
-    seeds = range(options.first, options.first + options.scenes)
     context = multiprocessing.get_context("spawn")
     with context.Pool(options.processes, torch.set_num_threads, (1,)) as pool:
-        for outcome in pool.imap_unordered(searched, seeds):
+        for outcome in pool.imap_unordered(searched, range(options.scenes)):
             counts[outcome.verdict] += 1
             counts["false candidates"] += len(outcome.false)
             pulls.append(outcome.pull)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import datetime
 import os
 import platform
+import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
 
 
-def processor() -> str:
+def _processor() -> str:
     """What the machine calls its processor."""
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -28,22 +29,24 @@ def _version(name: str) -> str:
         return f"{name} (not installed)"
 
 
-def provenance(command: str, packages: tuple[str, ...] = ("poppy",)) -> list[str]:
-    """Lines of Markdown: date, command, machine, versions.
+def provenance(command: str, *packages: str) -> dict[str, str]:
+    """Command, date, commit, machine and versions, for the metadata of a table.
 
     Parameters
     ----------
     command : str
-        The script, from the root of the project.
-    packages : tuple of str
+        The script and its options, from the root of the project, without "python -m".
+    packages : str
         What the table compares with.
     """
-    versions = ", ".join(
-        [f"Python {platform.python_version()}", f"torch {torch.__version__}"]
-        + [_version(name) for name in ("numpy", *packages)]
-    )
-    return [
-        f"- Measured {datetime.datetime.now(datetime.UTC):%Y-%m-%d} by `python {command}`.",
-        f"- {os.cpu_count()} cores of {processor()}, {torch.get_num_threads()} threads.",
-        f"- {versions}.",
-    ]
+    git = ["git", "describe", "--always", "--dirty"]
+    commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    versions = [_version(name) for name in ("torch", "numpy", *packages)]
+    threads = torch.get_num_threads()
+    return {
+        "command": f"python -m {command}",
+        "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
+        "commit": commit,
+        "machine": f"{os.cpu_count()} cores of {_processor()}, {threads} threads",
+        "versions": ", ".join([f"Python {platform.python_version()}", *versions]),
+    }

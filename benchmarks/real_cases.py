@@ -13,16 +13,16 @@ that only the cases without the library are like with like there. Fits, products
 table are kept per case, so that a run that was stopped goes on. For two rolls the table has the
 5-sigma contrast limits of `reduce` and of KLIP (`klip_curve`: the other roll and the reference
 frames, the best of 1 to 5 modes), both without and with their small-sample corrections, and
-"by ring": those of `reduce` with the noise of KLIP's curve, the scatter of the map of contrasts in
-a ring of width lambda/D with the correction of Mawet et al. (2014). "closed" is the part of the gap
-between KLIP's limit and that of a known star which is closed, (KLIP - ours) / (KLIP - known star)
-without corrections; the limit of a known star is that of Godoy et al. (2024, arXiv:2409.03485).
+`limit_by_ring`: those of `reduce` with the noise of KLIP's curve, the scatter of the map of
+contrasts in a ring of width lambda/D with the correction of Mawet et al. (2014). `closed` is the
+part of the gap between KLIP's limit and that of a known star which is closed, (KLIP - ours) / (KLIP
+- known star) without corrections; the limit of a known star is that of Godoy et al. (2024,
+arXiv:2409.03485).
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import resource
 import subprocess
@@ -38,6 +38,8 @@ from astropy import units as u
 from astropy.table import Table, vstack
 
 import pyklip_diffrender as dr
+from benchmarks.provenance import provenance
+from benchmarks.real_frames import DATA, frames_of, opd_of
 from pyklip_diffrender.io.files import write_table
 from pyklip_diffrender.pattern import choice as patterns
 from pyklip_diffrender.reduction import summarise
@@ -57,6 +59,13 @@ Case = tuple[str, str, str, str, str]
 "no library"); frames of other stars ("references" or "no references")."""
 
 GIVEN = ("star", "filter", "library", "references")
+
+COLUMNS = {
+    "limit": "contrast", "limit_small_sample": "small_sample", "limit_by_ring": "by_ring",
+    "klip": "KLIP", "klip_small_sample": "KLIP small sample", "known_star": "known_star",
+    "error_factor": "error_factor",
+}  # fmt: skip
+"""Columns of the table of limits, and where the row of a case has them."""
 
 FORMS = (
     ("no library", "references"),
@@ -92,12 +101,7 @@ def reduce_case(
     # Seven planets at a time, few of which are found, would widen the scatter of a single roll.
     most = planets if pair else min(planets, 3)
     injections = most if STARS.get(star) == "star" else 0
-    if star == "HIP-65426":
-        sequence = dr.ExposureSequence.from_files([data / "hip65426_f444w_calints.fits.gz"])
-        opd = data / "opd_2022-07-30.fits.gz"
-    else:
-        sequence = dr.ExposureSequence.from_files(data / "gto1184", target=star, filter=band)
-        opd = data / "opd_2022-08-14.fits.gz"
+    sequence = frames_of(data, star, band)
     science = sequence.science if pair else sequence.science[int(rolls[-1]) - 1 :][:1]
     others = [each for each in sequence.references if STARS.get(each.target) == "star"]
     given = tuple(others) if references == "references" else ()
@@ -105,7 +109,7 @@ def reduce_case(
         patterns.package_library = lambda: dr.PatternLibrary(())
     result = dr.reduce(
         replace(sequence, science=science, references=given),
-        start or opd,
+        start or opd_of(data, star),
         disk=STARS.get(star) == "disk",
         injections=injections,
     )
@@ -115,28 +119,18 @@ def reduce_case(
     snr = detection.residual_snr[distant]
     peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     row: dict[str, Any] = {
-        "star": star,
-        "filter": band,
-        "rolls": rolls,
-        "library": library,
-        "references": references,
+        "star": star, "filter": band, "rolls": rolls, "library": library, "references": references,
         "use": result.visit.in_words(),
         "status": result.fit.status.name,
         "chi2": round(result.fit.chi2_per_pixel, 3),
         "S/N scatter": round(float(np.nanstd(snr)), 3),
         "S/N range": f"{np.nanmin(snr):.1f} to {np.nanmax(snr):.1f}",
         "candidates": " ".join(
-            f"{s:.2f}@{r:.3f},{p:.1f}"
-            for s, r, p in zip(
-                detection.candidates["snr"],
-                detection.candidates["separation"].value,
-                detection.candidates["position_angle"].value,
-                strict=True,
-            )
+            f"{each['snr']:.2f}@{each['separation'].value:.3f},{each['position_angle'].value:.1f}"
+            for each in detection.candidates
         ),
-        "CPU s": round(seconds),
-        "GiB": round(peak_memory, 2),
-    }
+        "CPU s": round(seconds), "GiB": round(peak_memory, 2),
+    }  # fmt: skip
     curve = detection.contrast_curve
     ours = {
         name: np.interp(SEPARATIONS, curve["separation"].value, curve[name])
@@ -167,50 +161,6 @@ def reduce_case(
     (folder / "row.json").write_text(json.dumps(row))
 
 
-def print_tables(rows: list[dict[str, Any]]) -> None:
-    """Print one row per case, and the limits of the pairs."""
-    short = ("star", "filter", "rolls", "library", "references", "status", "chi2", "S/N scatter",
-             "S/N range", "candidates", "CPU s", "GiB")  # fmt: skip
-    Table([{key: row[key] for key in short} for row in rows]).pprint_all()
-    parts = []
-    for row in rows:
-        if "KLIP" not in row:
-            continue
-        ours, bound, klip = (np.array(row[name]) for name in ("contrast", "known_star", "KLIP"))
-        corrected, theirs = np.array(row["small_sample"]), np.array(row["KLIP small sample"])
-        by_ring = np.array(row["by_ring"])
-        columns = {
-            "arcsec": SEPARATIONS,
-            "ours": ours,
-            "KLIP": klip,
-            "ratio": klip / ours,
-            "ours, corrected": corrected,
-            "KLIP, corrected": theirs,
-            "ratio, corrected": theirs / corrected,
-            "by ring": by_ring,
-            "ratio, by ring": theirs / by_ring,
-            "known star": bound,
-            "ours / known": ours / bound,
-            "closed": (klip - ours) / (klip - bound),
-            "factor": np.array(row["error_factor"]),
-        }
-        for name in columns:
-            plain = name.startswith(("ratio", "ours /", "closed", "factor", "arcsec"))
-            columns[name] = np.round(columns[name], 2) if plain else columns[name]
-        table = Table(columns)
-        for name in ("ours", "KLIP", "ours, corrected", "KLIP, corrected", "by ring", "known star"):
-            table[name].format = ".2e"
-        case = " ".join(row[key] for key in ("star", "filter", "library", "references"))
-        table.add_column([case] * len(table), 0, "case")
-        parts.append(table)
-        print(case, "median (least) ratios:", end=" ")
-        for name in ("ratio", "ratio, corrected", "ratio, by ring"):
-            print(name, f"{np.median(table[name]):.2f} ({table[name].min():.2f})", end="; ")
-        print("\n", row.get("injections", ""))
-    if parts:
-        vstack(parts).pprint_all()
-
-
 def limits_of_pairs(rows: list[dict[str, Any]]) -> Table:
     """One row for each separation of every pair, with what both methods were given."""
     parts = []
@@ -219,41 +169,53 @@ def limits_of_pairs(rows: list[dict[str, Any]]) -> Table:
             continue
         part = Table({name: [row[name]] * len(SEPARATIONS) for name in GIVEN})
         part["separation"] = SEPARATIONS * u.arcsec
-        for name, key in (("limit", "contrast"), ("klip", "KLIP"), ("known_star", "known_star")):
-            part[name] = [float(f"{each:.4e}") for each in row[key]]
-        corrected = np.divide(row["KLIP small sample"], row["small_sample"])
-        part["ratio"] = np.round(np.divide(row["KLIP"], row["contrast"]), 3)
-        part["ratio_small_sample"] = np.round(corrected, 3)
-        part["error_factor"] = np.round(row["error_factor"], 3)
+        for name, key in COLUMNS.items():
+            part[name] = row[key]
+        ours, klip, known = part["limit"], part["klip"], part["known_star"]
+        part["ratio"] = klip / ours
+        part["ratio_small_sample"] = part["klip_small_sample"] / part["limit_small_sample"]
+        part["ratio_by_ring"] = part["klip_small_sample"] / part["limit_by_ring"]
+        part["over_known_star"] = ours / known
+        part["closed"] = (klip - ours) / (klip - known)
         parts.append(part)
     table = vstack(parts)
-    table.meta = {
-        "command": "python -m benchmarks.real_cases --output FOLDER --planets 0 --limits FILE",
-        "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
-    }
+    table.meta = provenance("benchmarks.real_cases --output FOLDER --planets 0 --limits FILE")
     about = {
         "library": "the package's patterns of other stars, or none",
         "references": "frames of other stars that both methods were given",
         "limit": "5-sigma contrast, median over the ring",
         "klip": "KLIP's limit, best of 1 to 5 modes, with the other roll and the references",
         "known_star": "limit for a known star, without error factor",
+        "limit_by_ring": "with the noise of KLIP's curve",
         "ratio": "KLIP / this package",
         "ratio_small_sample": "the same, each with its small-sample correction",
         "error_factor": "factor by which errors are multiplied",
     }
     for name, text in about.items():
         table[name].description = text
-    for name in ("limit", "klip", "known_star"):
-        table[name].format = ".2e"
-    for name in ("ratio", "ratio_small_sample", "error_factor"):
-        table[name].format = ".2f"
+    for name in table.colnames[len(GIVEN) + 1 :]:
+        table[name].format = ".2e" if name.startswith(("limit", "klip", "known")) else ".2f"
     return table
+
+
+def print_tables(rows: list[dict[str, Any]]) -> None:
+    """Print one row per case, the limits of the pairs, and their median and least ratios."""
+    short = ("star", "filter", "rolls", "library", "references", "status", "chi2", "S/N scatter",
+             "S/N range", "candidates", "CPU s", "GiB")  # fmt: skip
+    Table([{key: row[key] for key in short} for row in rows]).pprint_all()
+    for row in rows:
+        print(*(row[name] for name in GIVEN), row.get("injections", ""))
+    limits = limits_of_pairs(rows)
+    limits.pprint_all()
+    ratios = limits[[*GIVEN, "ratio", "ratio_small_sample", "ratio_by_ring"]].group_by(GIVEN)
+    for extreme in (np.median, np.min):
+        ratios.groups.aggregate(extreme).pprint_all()
 
 
 def main() -> None:
     """Reduce all cases in processes of their own and print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--planets", type=int, default=28)
     parser.add_argument(

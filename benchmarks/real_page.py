@@ -12,7 +12,6 @@ processes.
 from __future__ import annotations
 
 import argparse
-import datetime
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,11 +19,11 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
+from benchmarks.provenance import provenance
 from benchmarks.real_cases import FILTERS, STARS, cases
+from benchmarks.real_frames import DATA, opd_of
 from pyklip_diffrender.io.files import replacing
 
-DATA = Path("../shared/data")
-HIP_65426 = [str(DATA / "hip65426_f444w_calints.fits.gz"), str(DATA / "opd_2022-07-30.fits.gz")]
 AXIS = "128.5"
 """Position angle of AU Mic's disk, degrees (MacGregor et al. 2013, ApJL 762, L21: 128.4 +- 0.1)."""
 
@@ -35,7 +34,8 @@ def measurements(folder: Path) -> Iterator[tuple[str, list[str]]]:
         options = ["--output", str(folder / "cases"), "--case", *case]
         yield "_".join(case).replace(" ", ""), ["benchmarks.real_cases", *options]
     options = ["--output", str(folder / "flat"), "--planets", "0", "--opd", "flat"]
-    yield "flat", ["benchmarks.real_cases", *options, "--case", "G-7-34", "F444W", "pair"]
+    flat = ["G-7-34", "F444W", "pair", "library", "no references"]
+    yield "flat", ["benchmarks.real_cases", *options, "--case", *flat]
     for star in (each for each, kind in STARS.items() if kind == "star"):
         for band in FILTERS:
             which = ["--target", star, "--filter", band]
@@ -45,7 +45,8 @@ def measurements(folder: Path) -> Iterator[tuple[str, list[str]]]:
         yield f"disks_{band}", ["benchmarks.disks", "--filter", band]
         which = ["--target", "V-AU-MIC", "--filter", band, "--disk", AXIS]
         yield f"images_V-AU-MIC_{band}", ["benchmarks.images", *which]
-    frames, opd = HIP_65426
+    frames = str(DATA / "hip65426_f444w_calints.fits.gz")
+    opd = str(opd_of(DATA, "HIP-65426"))
     yield "star_flux", ["benchmarks.star_flux", "--frames", frames, "--opd", opd]
     products = str(folder / "hip65426")
     wide = ["detect", frames, "--opd", opd, "-o", products, "--wide", "--overwrite"]
@@ -79,9 +80,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=1)
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
-    git = ["git", "describe", "--always", "--dirty"]
-    commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    about = f"commit {commit}, {datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
+    about = "\n".join(provenance("benchmarks.real_page --output results").values())
     with ThreadPoolExecutor(options.processes) as pool:
         tasks = partial(measure, options.output, about)
         complete = all(list(pool.map(tasks, measurements(options.output))))

@@ -18,15 +18,16 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import subprocess
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from astropy.table import QTable
-from astropy.time import Time, TimeDelta
+from astropy.time import TimeDelta
 
 import pyklip_diffrender as dr
+from benchmarks.provenance import provenance
+from benchmarks.real_frames import frames_of, opd_of
 from benchmarks.synthetic_searches import found
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Motion, with_planets
@@ -165,10 +166,10 @@ SOURCES = (
 
 def real_system(data, star):
     """Truth, dates and combined search of sources injected into real rolls."""
-    opd, reductions, dates = data / "opd_2022-08-14.fits.gz", [], [0.0, 0.0]
+    opd, reductions, dates = opd_of(data), [], [0.0, 0.0]
     moved = -PROPER * LATER / YEAR
     for band, colour in zip(FILTERS, (1.0, 0.7), strict=True):
-        sequence = dr.ExposureSequence.from_files(data / "gto1184", target=star, filter=band)
+        sequence = frames_of(data, star, band)
         for k, roll in enumerate(sequence.science):
             alone = replace(sequence, science=(roll,), references=())
             (frame,) = dr.reduce(alone, opd, accuracy="quick").fit.frames
@@ -234,13 +235,7 @@ def main():
         rows.append((name, "missed", result.missed, 0.0, float(result.unexplained)))
         print(name, "missed", result.missed, "unexplained", result.unexplained, flush=True)
     table = QTable(rows=rows, names=("set", "bin", "number", "stated", "measured"))
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    table.meta = {
-        "command": f"python -m benchmarks.reliability --systems {options.systems}",
-        "commit": commit, "date": Time.now().isot[:10],
-    }  # fmt: skip
+    table.meta = provenance(f"benchmarks.reliability --systems {options.systems}")
     for name in ("stated", "measured"):
         table[name].info.format = ".4f"
     if options.output is not None:

@@ -169,7 +169,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("fit", type=Path)
     parser.add_argument("frames", type=Path, nargs="+")
-    parser.add_argument("--record", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
     fit = dr.Refinement.read(options.fit)
@@ -214,9 +213,6 @@ def main() -> None:
                 ratio = limits(replace(linear, frames=residuals), shown, away) / preset
                 result["models"][str(model)] = ratio.round(3).tolist()
             print(json.dumps(result), flush=True)
-            if options.record:
-                with options.record.open("a") as file:
-                    print(json.dumps(result), file=file)
 
 
 if __name__ == "__main__":

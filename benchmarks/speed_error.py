@@ -41,8 +41,8 @@ from torch import Tensor
 
 import pyklip_diffrender as dr
 from benchmarks.provenance import provenance
-from benchmarks.speed.rivals import paper_recipe
-from benchmarks.speed.setting import WAVELENGTH, Setting, coarse_steps
+from benchmarks.speed.rivals import ADAM_STEPS, adam, paper_recipe, star_after_adam
+from benchmarks.speed.setting import Setting, coarse_steps, of_stpsf, rendered
 from benchmarks.speed.timing import interleaved
 from pyklip_diffrender.drawing import save
 from pyklip_diffrender.io.files import write_table
@@ -57,8 +57,6 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 MODES_OF_GRADIENTS = 6.0
 """Cycles across the pupil of the modes by which gradients are compared."""
-
-ADAM_STEPS, LEARNING_RATE = 1000, 1e-11
 
 _OTHERS = ("the paper's recipe", "stpsf", "poppy", "prysm", "hcipy", "KLIP")
 """Ways of other codes begin with one of these."""
@@ -136,7 +134,7 @@ def image_points(setting: Setting, budget: float) -> list[Point]:
     ways = list(fidelities(setting))
     works = [partial(rendered, model, setting.opd) for *_, model in ways]
     recipe = paper_recipe(setting.arrays, setting.device)
-    works.append(partial(without_gradient, recipe, setting.opd))
+    works.append(partial(torch.no_grad()(recipe), setting.opd))
     names = [(way, label) for way, label, _ in ways] + [("the paper's recipe", "padded FFT")]
     errors = [setting.judge(work()).sigma for work in works]
     times = interleaved(works, budget, setting.device)
@@ -144,18 +142,6 @@ def image_points(setting: Setting, budget: float) -> list[Point]:
         Point("image", *name, seconds, error)
         for name, seconds, error in zip(names, times, errors, strict=True)
     ]
-
-
-def rendered(model: OpticalSystem, opd: Tensor) -> Tensor:
-    """The image of the star, for a wavefront on the fine grid."""
-    with torch.no_grad():
-        return model(downsample(opd, model.npix))
-
-
-def without_gradient(image: Callable[[Tensor], Tensor], opd: Tensor) -> Tensor:
-    """Value of a function of the wavefront."""
-    with torch.no_grad():
-        return image(opd)
 
 
 def broad_points(setting: Setting, budget: float) -> list[Point]:
@@ -254,32 +240,10 @@ def adam_point(setting: Setting) -> Point:
 
     The error is that after all steps, taken with the change of a fine image on fewer samples.
     """
-    data = torch.from_numpy(setting.observation.data[0]).to(setting.device)
-    photons = setting.scene.star.photons
-
-    def stepper(image: Callable[[Tensor], Tensor], start: Tensor) -> Callable[[], Tensor]:
-        opd = start.clone().requires_grad_()
-        optimiser = torch.optim.Adam([opd], lr=LEARNING_RATE)
-
-        def step() -> Tensor:
-            optimiser.zero_grad()
-            (photons * image(opd) - data).abs().mean().backward()
-            optimiser.step()
-            return opd
-
-        return step
-
-    slow = stepper(paper_recipe(setting.arrays, setting.device), setting.measured)
-    slow()
-    (seconds,) = interleaved([slow], 0.1 if setting.quick else 3.0, setting.device)
-    coarse = coarse_steps(setting.model, setting.measured, setting.coarse[1])
-    small = downsample(setting.measured, coarse.npix)
-    step = stepper(coarse, small)
-    for _ in range(10 if setting.quick else ADAM_STEPS):
-        opd = step()
-    factor = setting.npix // coarse.npix
-    change = (opd.detach() - small).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
-    error = setting.judge(rendered(setting.model, setting.measured + change)).sigma
+    step = adam(paper_recipe(setting.arrays, setting.device), setting.measured, setting)
+    step()
+    (seconds,) = interleaved([step], 0.1 if setting.quick else 3.0, setting.device)
+    error = setting.judge(star_after_adam(setting)).sigma
     note = f"one step timed, times {ADAM_STEPS}"
     label = f"{ADAM_STEPS} Adam steps"
     return Point("fit", "the paper's recipe", label, ADAM_STEPS * seconds, error, note=note)
@@ -334,24 +298,11 @@ def reduction_points(frames: Sequence[Path], opd: Path, *, quick: bool) -> list[
 
 def stpsf_points(setting: Setting, budget: float) -> list[Point]:
     """stpsf's own calc_psf for several samplings, and the same arrays in this package."""
-    if setting.data is None:
+    if setting.stpsf is None:
         return []
-    from benchmarks.speed.plain import plain_stpsf
-    from pyklip_diffrender.bridges import from_webbpsf
-
-    instrument = plain_stpsf(setting.data, 1024)
+    instrument, call = setting.stpsf
     photons, read_noise = setting.scene.star.photons, setting.scene.read_noise
-    call: dict[str, Any] = {
-        "monochromatic": WAVELENGTH, "fov_pixels": setting.fov, "detector_oversample": 1,
-        "add_distortion": False,
-    }  # fmt: skip
-
-    def converted(cells: float) -> Callable[[], Any]:
-        model = from_webbpsf(instrument, fft_oversample=4, occulter_sampling=cells, **call)
-        opd = model.opd(None)
-        return lambda: rendered(model, opd).numpy()
-
-    truth = converted(16.0)()
+    truth = of_stpsf(setting, 16.0)().numpy()
     noise = np.sqrt(photons * truth + read_noise**2)
 
     def sigma(image: Any) -> float:
@@ -365,7 +316,7 @@ def stpsf_points(setting: Setting, budget: float) -> list[Point]:
         label = f"fft_oversample {pad}"
         points.append(Point("image", "stpsf calc_psf", label, seconds, sigma(image)))
     ways = (2.0, 3.0, 6.0)
-    works = [converted(cells) for cells in ways]
+    works = [of_stpsf(setting, cells) for cells in ways]
     errors = [sigma(work()) for work in works]
     for cells, seconds, error in zip(ways, interleaved(works, budget), errors, strict=True):
         label = f"{cells:g} cells per lambda/D"
@@ -374,24 +325,15 @@ def stpsf_points(setting: Setting, budget: float) -> list[Point]:
     return points
 
 
-def measure(setting: Setting, *, klip: Path | None = None, budget: float = 2.0) -> list[Point]:
-    """All points.
-
-    Parameters
-    ----------
-    setting : Setting
-    klip : Path, optional
-        Table of `examples/paper/klip_table.py`.
-    budget : float
-        Seconds for each timed function.
-    """
+def measure(setting: Setting, budget: float) -> list[Point]:
+    """All points, with `budget` seconds for each timed function."""
     return [
         *image_points(setting, budget),
         *stpsf_points(setting, budget),
         *broad_points(setting, budget),
         *gradient_points(setting, budget),
         *fit_points(setting),
-        *([] if klip is None else klip_points(klip)),
+        *klip_points(RESULTS / "klip_table_measured.ecsv"),
     ]
 
 
@@ -402,8 +344,7 @@ def as_table(points: Sequence[Point], command: str) -> Table:
         table[name].info.format = ".3g"
     table["seconds"].unit = "s"
     table["error"].description = "; ".join(f"{key}: {value}" for key, value in UNITS.items())
-    lines = provenance(command.removeprefix("python "), ("stpsf",))
-    table.meta["provenance"] = [line.removeprefix("- ") for line in lines]
+    table.meta = provenance(command, "stpsf")
     return table
 
 
@@ -444,16 +385,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--figure", type=Path, metavar="TABLE", help="only draw a table again")
     options = parser.parse_args(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
-    command = "python -m benchmarks.speed_error"
+    command = "benchmarks.speed_error"
     if options.figure:
         table = Table.read(options.figure)
     else:
         setting = Setting(options.quick, options.device)
-        points = measure(
-            setting,
-            klip=RESULTS / "klip_table_measured.ecsv",
-            budget=0.05 if options.quick else 2.0,
-        )
+        points = measure(setting, 0.05 if options.quick else 2.0)
         if options.frames:
             points += reduction_points(options.frames, options.opd, quick=options.quick)
         command += " --quick" * options.quick + " --frames FILES --opd MAP" * bool(options.frames)

@@ -131,14 +131,6 @@ def faint_planet(separation, dtype):
     return worst(got, planet_photons(system(torch.float64), scene, planet, opd))
 
 
-def summed_in_float32(separation):
-    """The error of that planet if star and planet were added up in float32."""
-    model, opd = system(torch.float32), wavefront()
-    star = model(opd)
-    planet = 1e-10 * model(opd, Planet(1.0, separation, 40.0).offset)
-    return worst((star + planet) - star, planet)
-
-
 def _chi2(dtype, opd):
     truth = system(torch.float64)(wavefront()).detach()
     sigma = torch.sqrt(FLUX * truth + READ_NOISE**2)

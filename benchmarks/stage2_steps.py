@@ -15,7 +15,6 @@ the frames before.
 from __future__ import annotations
 
 import argparse
-import datetime
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -30,6 +29,8 @@ from scipy.ndimage import fourier_shift, gaussian_filter, median_filter
 
 import pyklip_diffrender as dr
 from benchmarks.neighbours import NAMES, SIDE, light_of, sources_of, with_source
+from benchmarks.provenance import provenance
+from benchmarks.real_frames import DATA, opd_of
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.files import write_table
 
@@ -204,8 +205,8 @@ def measured(folder: Path, opd: Path) -> dict[str, Any]:
 def main() -> None:
     """Reduce the files with each step."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
-    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
+    parser.add_argument("--frames", type=Path, default=DATA / "gto1184")
+    parser.add_argument("--opd", type=Path, default=opd_of(DATA))
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -241,12 +242,11 @@ def main() -> None:
     numbers = ("candidates", "contrast", "chi2", "star", "limits")
     result = Table([{**dict.fromkeys(numbers, np.nan), **row} for row in table])
     result.round(dict.fromkeys(numbers, 3))
-    result.meta = {
-        "command": "python -m benchmarks.stage2_steps --output docs/results/stage2_steps.ecsv",
-        "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
-        "note": "contrast: measured over true, of the added source; star and limits (median, in "
-        "units of flux): over those without the step",
-    }
+    result.meta = provenance("benchmarks.stage2_steps --output docs/results/stage2_steps.ecsv")
+    result.meta["note"] = (
+        "contrast: measured over true, of the added source; star and limits (median, in units of "
+        "flux): over those without the step"
+    )
     write_table(result, options.output)
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import pyklip_diffrender as dr
-from benchmarks.real_options import real_frames_parser
+from benchmarks.real_frames import real_frames_parser
 from pyklip_diffrender.refinement import jansky_per_unit, with_star_flux
 
 SHARES = (1.0, 0.9, 1.1, 1.2)

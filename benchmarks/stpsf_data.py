@@ -158,6 +158,11 @@ def make_stpsf_data(folder, npix=256):
     return folder
 
 
+def stop_of(mask):
+    """The Lyot stop that belongs to a mask, as stpsf calls it."""
+    return mask if mask.endswith("WB") else "MASKRND"
+
+
 def nircam(folder, image_mask="MASK335R", pupil_mask="MASKRND", band="F444W", npix=256,
            pupil="RevW", aperture=None, **options):  # fmt: skip
     """A configured stpsf.NIRCam."""

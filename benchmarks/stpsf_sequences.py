@@ -3,7 +3,7 @@
 Run from the root of the project, with stpsf installed and its data named by STPSF_PATH::
 
     STPSF_PATH=... python -m benchmarks.stpsf_sequences --output FOLDER [--cases NAME ...]
-        [--repeat N] [--size PIXELS] [--age DAYS] [--flux FLUX] [--accuracy quick]
+        [--references N] [--repeat N] [--size PIXELS]
 
 Each case has two rolls of a star with two planets, as calints files with the headers of MAST. The
 images are stpsf's, with its internal wavefront errors, jitter, distortion, charge diffusion and
@@ -12,8 +12,7 @@ and from roll to roll; the star is a few milliarcseconds from the middle of the 
 has an error of 2 % in every pixel, which nobody tells the reduction; pixels are bad, some of them
 without a flag; and there are photon and read noise. With ``--references`` a second, brighter star
 was observed at small dithers. Other numbers of ``--repeat`` have other wavefronts, flat fields,
-bad pixels and noise, and ``--size`` is the side of the fitted square. With ``--age`` the map is so
-many days old, and the wavefront has drifted accordingly.
+bad pixels and noise, and ``--size`` is the side of the fitted square.
 
 Prints a row for each case: planets that were found and missed, false candidates, pulls of flux and
 position, scatter of the S/N without the candidates, limits over those for a known star beyond 0.5
@@ -38,11 +37,12 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
-from astropy.time import Time
+from astropy.table import Table
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
+from benchmarks.stpsf_data import nircam, stop_of
 from pyklip_diffrender.instrument import detector_place, filter_shift
 from pyklip_diffrender.optics import resample
 from pyklip_diffrender.reduction.klip import klip_curve
@@ -59,6 +59,9 @@ DITHERS = ((0.0, 0.0), (0.01, 0.01), (-0.01, 0.01), (0.01, -0.01), (-0.01, -0.01
 FLAT_ERROR = 0.02
 FLAGGED, UNFLAGGED = 0.005, 4
 """Fraction of the pixels with a flag, and number of bad ones without one near the star."""
+
+MAP = "opd_2022-10-01.fits"
+"""File of the map, two days before the frames."""
 
 MARGIN = 8
 """Pixels of the frames beyond the fitted square, on each side."""
@@ -87,10 +90,6 @@ class Case:
     flux: float = 3e7
     size: int = 80
     """Side of the fitted square, pixels."""
-    age: float | None = None
-    """Days from the map to the frames, in which the wavefront drifts like a random walk, by 9 nm
-    rms in 3.6 days (Feng et al. 2025, section 4); None: two days, in which it drifts by `DRIFT`."""
-    accuracy: str = "full"
 
     @property
     def name(self) -> str:
@@ -100,17 +99,6 @@ class Case:
     def side(self) -> int:
         """Side of the frames, pixels."""
         return self.size + 2 * MARGIN
-
-    @property
-    def drift(self) -> float:
-        """Rms of the wavefront's change since the map, m."""
-        return DRIFT if self.age is None else 9e-9 * float(np.sqrt(self.age / 3.6))
-
-    @property
-    def map_name(self) -> str:
-        """Name of the file of the map, with its date."""
-        date = Time("2022-10-03") - (2 if self.age is None else self.age) * u.day
-        return f"opd_{date.isot[:10]}.fits"
 
 
 def _planets(*places: tuple[float, float, float]) -> tuple[Planet, ...]:
@@ -140,22 +128,9 @@ CASES = {
 }  # fmt: skip
 
 
-def instrument_of(case: Case) -> Any:
-    """stpsf's NIRCam in the set-up of a case."""
-    import stpsf
-
-    nircam = stpsf.NIRCam()
-    nircam.filter = case.filter
-    bar = case.mask.endswith("WB")
-    nircam.image_mask, nircam.pupil_mask = case.mask, case.mask if bar else "MASKRND"
-    nircam.set_position_from_aperture_name(case.aperture)
-    nircam.options["nd_squares"] = False
-    return nircam
-
-
-def map_of(nircam: Any) -> tuple[np.ndarray, fits.Header]:
+def map_of(instrument: Any) -> tuple[np.ndarray, fits.Header]:
     """The OPD map that stpsf comes with, m."""
-    path = Path(os.environ["STPSF_PATH"]) / Path(str(nircam.pupilopd)).name
+    path = Path(os.environ["STPSF_PATH"]) / Path(str(instrument.pupilopd)).name
     with fits.open(path) as hdus:
         scale = u.Unit(hdus[0].header["BUNIT"].rstrip("s")).to(u.m)
         data = hdus[0].data if hdus[0].data.ndim == 2 else hdus[0].data[0]
@@ -163,7 +138,7 @@ def map_of(nircam: Any) -> tuple[np.ndarray, fits.Header]:
 
 
 def image(
-    nircam: Any, case: Case, opd: np.ndarray, header: fits.Header, place: tuple[float, float],
+    instrument: Any, case: Case, opd: np.ndarray, header: fits.Header, place: tuple[float, float],
     nlambda: int,
 ) -> np.ndarray:  # fmt: skip
     """The image of a point source of unit flux at a place behind the mask, arcsec.
@@ -177,9 +152,9 @@ def image(
     import stpsf.stpsf_core
 
     header["BUNIT"] = "meter"
-    nircam.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
-    nircam.options["source_offset_x"], nircam.options["source_offset_y"] = place
-    psf = nircam.calc_psf(
+    instrument.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
+    instrument.options["source_offset_x"], instrument.options["source_offset_y"] = place
+    psf = instrument.calc_psf(
         nlambda=nlambda,
         fft_oversample=OVERSAMPLE,
         detector_oversample=OVERSAMPLE,
@@ -193,7 +168,7 @@ def image(
     sky = np.stack(aperture.sci_to_idl(x + aperture.XSciRef, y + aperture.YSciRef)[::-1])
     area = aperture.XSciScale * aperture.YSciScale / (OVERSAMPLE * scale) ** 2
     light = area * map_coordinates(fine, sky / scale + middle)
-    channel = "NIRCAM_SW" if nircam.channel == "short" else "NIRCAM_LW"
+    channel = "NIRCAM_SW" if instrument.channel == "short" else "NIRCAM_LW"
     diffusion = stpsf.constants.INSTRUMENT_DETECTOR_CHARGE_DIFFUSION_DEFAULT_PARAMETERS[channel]
     light = gaussian_filter(light, diffusion / scale)
     detected = psf["DET_DIST"]
@@ -205,13 +180,12 @@ def image(
 
 def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0) -> Path:
     """Write the frames of a case and the map of before; returns the map."""
-    nircam = instrument_of(case)
-    opd, header = map_of(nircam)
-    before = folder / case.map_name
+    instrument = nircam(Path(os.environ["STPSF_PATH"]), case.mask, stop_of(case.mask), case.filter,
+                        1024, aperture=case.aperture, nd_squares=False)  # fmt: skip
+    opd, header = map_of(instrument)
+    before = folder / MAP
     hdu = fits.PrimaryHDU(opd, header)
     hdu.header["BUNIT"] = "m"
-    if case.age is not None:
-        hdu.header["DATE-OBS"] = case.map_name[4:14]
     hdu.writeto(before, overwrite=True)
     # Of its own for every case: errors of planets at the same place are independent.
     rng = np.random.default_rng([*case.name.encode(), *([repeat] if repeat else [])])
@@ -220,31 +194,33 @@ def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0)
     flat = 1 + FLAT_ERROR * rng.normal(size=(side, side))
     flagged = rng.random((side, side)) < FLAGGED
     hot = rng.integers(side // 2 - 15, side // 2 + 15, (UNFLAGGED, 2))
-    changed = opd + _change(int(seeds[0]), case.drift, opd)
+    drifted = opd + changed(int(seeds[0]), DRIFT, len(opd))
     for k, (roll, star) in enumerate(zip(ROLLS, STARS, strict=True), 1):
-        now = changed + _change(int(seeds[k]), BETWEEN, opd)
-        light = image(nircam, case, now, header, star, case.nlambda[0])
+        now = drifted + changed(int(seeds[k]), BETWEEN, len(opd))
+        light = image(instrument, case, now, header, star, case.nlambda[0])
         for planet in case.planets:
             away = np.add(star, planet.rotated(-roll).offset)
-            source = image(nircam, case, now, header, (away[0], away[1]), case.nlambda[1])
+            source = image(instrument, case, now, header, (away[0], away[1]), case.nlambda[1])
             light = light + planet.contrast * source
-        _write(case, folder, "HD 1", k, roll, flat * case.flux * light, flagged, hot, repeat)
+        write(case, folder, "HD 1", k, roll, flat * case.flux * light, flagged, hot, repeat)
     for k, dither in enumerate(DITHERS[:references], len(ROLLS) + 1):
-        now = changed + _change(int(seeds[k]), BETWEEN, opd)
-        light = image(nircam, case, now, header, dither, case.nlambda[0])
+        now = drifted + changed(int(seeds[k]), BETWEEN, len(opd))
+        light = image(instrument, case, now, header, dither, case.nlambda[0])
         light = 2 * flat * case.flux * light
-        _write(case, folder, "HD 2", k, 120.0, light, flagged, hot, repeat)
+        write(case, folder, "HD 2", k, 120.0, light, flagged, hot, repeat)
     return before
 
 
-def _change(seed: int, rms: float, opd: np.ndarray) -> np.ndarray:
-    return np.asarray(resample(dr.wavefront.random_opd(seed, npix=256, rms=rms).data, len(opd)))
+def changed(seed: int, rms: float, npix: int) -> np.ndarray:
+    """A change of the wavefront, m."""
+    return np.asarray(resample(dr.wavefront.random_opd(seed, npix=256, rms=rms).data, npix))
 
 
-def _write(
+def write(
     case: Case, folder: Path, star: str, k: int, roll: float, light: np.ndarray,
     flagged: np.ndarray, hot: np.ndarray, repeat: int,
 ) -> None:  # fmt: skip
+    """Write a calints file of a case, with bad pixels and noise."""
     place = detector_place(case.mask, case.filter, case.aperture.rpartition("_")[2]
                            if case.mask.endswith("WB") else None)  # fmt: skip
     middle = (case.side - 1) / 2
@@ -279,20 +255,19 @@ def _write(
 
 def reduced(case: Case, folder: Path, references: int = 0, repeat: int = 0) -> dict[str, Any]:
     """Make the frames of a case, reduce them with the defaults, and compare with the truth."""
-    done = folder / ("result.json" if case.accuracy == "full" else f"{case.accuracy}.json")
+    done = folder / "result.json"
     if done.is_file():
         result: dict[str, Any] = json.loads(done.read_text(encoding="utf-8"))
         return result
     folder.mkdir(parents=True, exist_ok=True)
     made = time.process_time()
-    before = folder / case.map_name
+    before = folder / MAP
     if len(list((folder / "frames").glob("*.fits"))) < len(ROLLS) + references:
         before = write_frames(case, folder, references, repeat)
     made = time.process_time() - made
     sequence = ExposureSequence.from_files(folder / "frames", target="HD 1")
     began = time.process_time()
-    size = case.size if case.accuracy == "full" else None
-    reduction = dr.reduce(sequence, before, size=size, accuracy=case.accuracy)
+    reduction = dr.reduce(sequence, before, size=case.size)
     seconds = time.process_time() - began
     result = (
         compare(case, reduction)
@@ -382,33 +357,27 @@ def _sky(separation: u.Quantity, angle: u.Quantity) -> np.ndarray:
     return np.array([r * np.sin(t), r * np.cos(t)])
 
 
-def line(result: dict[str, Any]) -> str:
-    """A row of the table of the documentation."""
-    planets = result["planets"]
-    found = [each for each in planets if "snr" in each]
-
-    def listed(key: str, spec: str) -> str:
-        return ", ".join(format(each[key], spec) for each in found) or "-"
-
-    limits = result["limits_over_known_star"]
-    return (
-        f"| {result['case']} | {len(found)} of {len(planets)} | {len(result['false'])} "
-        f"| {listed('snr', '.0f')} | {listed('ratio', '.2f')} | {listed('flux_pull', '+.1f')} "
-        f"| {listed('separation_pull', '+.1f')} | {listed('angle_pull', '+.1f')} "
-        f"| {listed('away_mas', '.1f')} | {result['snr_scatter']:.2f} "
-        f"| {'-' if limits is None else format(limits, '.2f')} | {result['status']} "
-        f"| {result['cpu']:.0f} | {result['memory_gb']:.1f} |"
-    )
+def rows_of(results: list[dict[str, Any]]) -> Table:
+    """One row for each planet."""
+    about = ("case", "status", "snr_scatter", "limits_over_known_star", "cpu", "memory_gb")
+    measured = ("snr", "ratio", "flux_pull", "separation_pull", "angle_pull", "away_mas")
+    rows = []
+    for result in results:
+        shared = {name: result[name] for name in about} | {"false": len(result["false"])}
+        rows += [shared | dict.fromkeys(measured, np.nan) | each for each in result["planets"]]
+    table = Table(rows)
+    for name in table.colnames:
+        if table[name].dtype.kind == "f":
+            table[name].format = ".3g"
+    return table
 
 
-def pulls(results: list[dict[str, Any]]) -> str:
-    """Number, mean and rms of the pulls of all planets that were found."""
-    planets = [each for result in results for each in result["planets"] if "snr" in each]
-    words = []
-    for name in ("flux", "separation", "angle"):
-        values = np.array([each[f"{name}_pull"] for each in planets])
-        words.append(f"{name} {values.mean():+.2f}, {np.sqrt((values**2).mean()):.2f}")
-    return f"pulls of {len(planets)} planets, mean and rms: {'; '.join(words)}"
+def print_pulls(table: Table) -> None:
+    """Print number, mean and rms of the pulls of all planets that were found."""
+    for name in ("flux_pull", "separation_pull", "angle_pull"):
+        values = table[name][np.isfinite(table[name])]
+        print(f"{name} of {len(values)} planets: mean {np.mean(values):+.2f}, rms "
+              f"{np.sqrt(np.mean(values**2)):.2f}")  # fmt: skip
 
 
 def _run(case: Case, folder: Path, references: int, repeat: int) -> dict[str, Any]:
@@ -424,35 +393,23 @@ def main() -> None:
     parser.add_argument("--references", type=int, default=0, choices=range(len(DITHERS) + 1))
     parser.add_argument("--repeat", type=int, default=0, choices=range(60))
     parser.add_argument("--size", type=int, default=Case.size)
-    parser.add_argument("--age", type=float, help="days from the map to the frames")
-    parser.add_argument("--flux", type=float, default=Case.flux, help="of the star")
-    parser.add_argument("--accuracy", default=Case.accuracy, choices=["full", "quick"])
     options = parser.parse_args()
-    columns = ["case", "found", "false", "S/N", "flux / truth", "pull of flux", "of separation",
-               "of angle", "away, mas", "S/N scatter", "limits / known star", "status", "CPU s",
-               "GB"]  # fmt: skip
-    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
     context = multiprocessing.get_context("spawn")
     for name in options.cases:
         again = f"_{options.repeat}" if options.repeat else ""
-        changes = {key: getattr(options, key) for key in ("size", "age", "flux", "accuracy")}
-        case = replace(CASES[name], **changes)
-        other = "".join(
-            f"_{key}{changes[key]:g}"
-            for key in ("size", "age", "flux")
-            if changes[key] != getattr(Case, key)
-        )
+        other = f"_size{options.size}" if options.size != Case.size else ""
         folder = options.output / f"{name.replace(' ', '_')}_{options.references}{again}{other}"
+        case = replace(CASES[name], size=options.size)
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             try:
                 about = (case, folder, options.references, options.repeat)
                 result = pool.submit(_run, *about).result()
             except Exception as error:
-                print(f"| {name} | {type(error).__name__}: {error} |", flush=True)
+                print(f"{name}: {type(error).__name__}: {error}", flush=True)
             else:
-                print(line(result), flush=True)
+                rows_of([result]).pprint_all()
     done = sorted(options.output.glob("*/result.json"))
-    print(pulls([json.loads(path.read_text(encoding="utf-8")) for path in done]))
+    print_pulls(rows_of([json.loads(path.read_text(encoding="utf-8")) for path in done]))
 
 
 if __name__ == "__main__":

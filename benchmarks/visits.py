@@ -40,7 +40,6 @@ import pyklip_diffrender as dr
 from benchmarks import stpsf_sequences as made
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.instrument import detector_place
-from pyklip_diffrender.optics import resample
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.scene import ExposureSequence, Planet
 
@@ -114,11 +113,11 @@ def write_frames(visit: Visit, folder: Path) -> Path:
     case, side = visit.case, visit.case.side
     seeds = rng.integers(2**31, size=2 + visit.rolls + visit.dithers)
     opd = np.asarray(dr.wavefront.random_opd(int(seeds[0]), npix=NPIX, rms=6e-8).data)
-    before = folder / "opd_2022-10-01.fits"
+    before = folder / made.MAP
     hdu = fits.PrimaryHDU(opd)
     hdu.header["BUNIT"] = "m"
     hdu.writeto(before, overwrite=True)
-    changed = opd + _change(int(seeds[1]), made.DRIFT)
+    changed = opd + made.changed(int(seeds[1]), made.DRIFT, NPIX)
     models = {
         temperature: dr.model_for(
             _headers(visit), side, npix=NPIX, nlambda=13, source=temperature, dtype=torch.float64
@@ -139,11 +138,11 @@ def write_frames(visit: Visit, folder: Path) -> Path:
         return np.asarray(light.numpy())
 
     def exposure(star: str, k: int, roll: float, light: np.ndarray) -> None:
-        made._write(case, folder, star, k, roll, flat * case.flux * light, flagged, hot,
+        made.write(case, folder, star, k, roll, flat * case.flux * light, flagged, hot,
                     visit.number % 60)  # fmt: skip
 
     for k in range(visit.rolls):
-        wavefront = changed + _change(int(seeds[2 + k]), visit.drift)
+        wavefront = changed + made.changed(int(seeds[2 + k]), visit.drift, NPIX)
         place, roll = np.array(made.STARS[k]), made.ROLLS[k]
         light = image(models[5700.0], wavefront, place)
         for planet in case.planets:
@@ -152,7 +151,7 @@ def write_frames(visit: Visit, folder: Path) -> Path:
         exposure("HD 1", k + 1, roll, light)
     other = models[visit.temperature]
     for k in range(visit.dithers):
-        wavefront = changed + _change(int(seeds[2 + visit.rolls + k]), visit.drift)
+        wavefront = changed + made.changed(int(seeds[2 + visit.rolls + k]), visit.drift, NPIX)
         away = (0.03, -0.02) if visit.displaced and k == 0 else (0.0, 0.0)
         place = np.add(DITHERS[k], away)
         light = image(other, wavefront, place)
@@ -160,10 +159,6 @@ def write_frames(visit: Visit, folder: Path) -> Path:
             light = light + visit.companion * image(other, wavefront, np.add(place, (0.7, -0.5)))
         exposure("HD 2", k + 3, 120.0, visit.brightness * light)
     return before
-
-
-def _change(seed: int, rms: float) -> np.ndarray:
-    return np.asarray(resample(dr.wavefront.random_opd(seed, npix=256, rms=rms).data, NPIX))
 
 
 def reduced(visit: Visit, folder: Path) -> dict[str, Any]:

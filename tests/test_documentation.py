@@ -125,7 +125,7 @@ def test_documented_scripts_have_the_options(program):
         for source in sources:
             assert source.exists(), f"{place}: there is no {script}"
         # Some share options in a module beside them.
-        sources += [ROOT / "benchmarks" / "real_options.py", ROOT / "examples/paper/scene.py"]
+        sources += [ROOT / "benchmarks" / "real_frames.py", ROOT / "examples/paper/scene.py"]
         code = "".join(source.read_text(encoding="utf-8") for source in sources)
         for option in arguments:
             if option.startswith("--") and option != "--help":

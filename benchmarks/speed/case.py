@@ -38,14 +38,10 @@ class Case:
         Maps a result of that function to its errors.
     precision : str
         "float64" or "float32".
-    mode : str
-        "eager", "compiled" or "graph".
     reference : bool
         Whether the row's ratios are with respect to this case.
     times : float
         Number of times that the timed piece is needed; the total is extrapolated.
-    memory : bool
-        Measure the memory as well.
     note : str
         Remark for the reader.
     size : float
@@ -57,17 +53,10 @@ class Case:
     make: Callable[[], Callable[[], Any]] | None
     judge: Callable[[Any], Accuracy] = field(default=lambda answer: Accuracy())
     precision: str = "float64"
-    mode: str = "eager"
     reference: bool = False
     times: float = 1.0
-    memory: bool = False
     note: str = ""
     size: float = math.nan
-
-    @property
-    def key(self) -> str:
-        """Unique name of the case."""
-        return f"{self.row} | {self.column} | {self.precision} | {self.mode}"
 
 
 def missing(row: str, column: str, why: str) -> Case:

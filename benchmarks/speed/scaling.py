@@ -6,11 +6,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import torch
-
 from benchmarks.speed.case import Case
-from benchmarks.speed.setting import Setting
-from pyklip_diffrender.linear.response import WavefrontResponse
+from benchmarks.speed.setting import Setting, rendered
+from pyklip_diffrender.linear.response import WavefrontResponse, downsample
 from pyklip_diffrender.refinement import FitSettings, refine
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
@@ -19,17 +17,7 @@ SCALING = "scaling"
 
 
 def _image(setting: Setting, **changes: Any) -> Callable[[], Callable[[], Any]]:
-    def make() -> Callable[[], Any]:
-        model = setting.model.with_fidelity(**changes)
-        opd = torch.nn.functional.avg_pool2d(setting.opd[None], setting.npix // model.npix)[0]
-
-        def work() -> Any:
-            with torch.no_grad():
-                return model(opd)
-
-        return work
-
-    return make
+    return lambda: partial(rendered, setting.model.with_fidelity(**changes), setting.opd)
 
 
 def scaling(setting: Setting) -> list[Case]:
@@ -82,10 +70,8 @@ def _frames(setting: Setting, count: int) -> Callable[[], Any]:
     """Several frames with their own star positions fitted together: 40 pixels, 8 cycles."""
     npix = setting.npix // 4
     model = setting.host_model.with_fidelity(npix=npix, fov_pixels=setting.fov // 2)
-    small = torch.nn.functional.avg_pool2d(
-        torch.stack([setting.opd, setting.measured])[None].cpu(), setting.npix // npix
-    )[0]
-    frames = [simulate(model, setting.scene, small[0], seed=k) for k in range(count)]
+    now, before = (downsample(each.cpu(), npix) for each in (setting.opd, setting.measured))
+    frames = [simulate(model, setting.scene, now, seed=k) for k in range(count)]
     basis = default_basis(4.0 if setting.quick else 8.0)
     settings = FitSettings(basis=basis, max_iterations=6)
-    return lambda: refine(model, frames, small[1].numpy(), settings=settings)
+    return lambda: refine(model, frames, before.numpy(), settings=settings)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,9 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.speed.case import Accuracy
+from benchmarks.stpsf_data import nircam
+from pyklip_diffrender.bridges import from_webbpsf
 from pyklip_diffrender.instrument.masks import MASKS
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.scene.objects import PAPER_SEGMENT_GAP, Planet, Scene
@@ -33,6 +39,12 @@ WAVELENGTH = 4.5e-6
 HOURS = 40.0
 CELLS = 4
 """Samples per lambda/D on the occulter, of the codes that are compared with."""
+
+
+def rendered(model: OpticalSystem, opd: Tensor) -> Tensor:
+    """The image of the star, for a wavefront on the fine grid."""
+    with torch.no_grad():
+        return model(downsample(opd, model.npix))
 
 
 @dataclass(frozen=True)
@@ -75,13 +87,10 @@ class Setting:
         A coarse pupil and a small field: to see whether everything runs.
     device : str
         Of this package and the paper's recipe; the other codes run on the processor.
-    stpsf_path : str
-        stpsf's data; default the environment variable STPSF_PATH.
     """
 
     quick: bool = False
     device: str = "cpu"
-    stpsf_path: str = ""
 
     @property
     def npix(self) -> int:
@@ -98,12 +107,23 @@ class Setting:
         """Pupil samples of the coarse models."""
         return (32, 64) if self.quick else (128, 256, 512)
 
-    @property
-    def data(self) -> Path | None:
-        """The data directory of stpsf, if there is one."""
-        named = self.stpsf_path or os.environ.get("STPSF_PATH", "")
+    @cached_property
+    def stpsf(self) -> tuple[Any, dict[str, Any]] | None:
+        """stpsf's NIRCam behind MASK335R, without the ND squares, and arguments of its calc_psf.
+
+        None without stpsf or its data, which the environment variable STPSF_PATH names.
+        """
+        named = os.environ.get("STPSF_PATH", "")
+        if not named or find_spec("stpsf") is None:
+            return None
         # Absolute, because stpsf joins some of its paths with it twice.
-        return Path(named).resolve() if named and Path(named).is_dir() else None
+        folder = Path(named).resolve()
+        os.environ["STPSF_PATH"] = str(folder)
+        instrument = nircam(folder, npix=1024, nd_squares=False)
+        return instrument, {
+            "monochromatic": WAVELENGTH, "fov_pixels": self.fov, "detector_oversample": 1,
+            "add_distortion": False,
+        }  # fmt: skip
 
     @cached_property
     def model(self) -> OpticalSystem:
@@ -197,3 +217,11 @@ class Setting:
             cells=2 * int(np.ceil(MASKS["MASK335R"].radius * ARCSEC / cell)) + 2,
             pixels=self.fov,
         )
+
+
+def of_stpsf(setting: Setting, cells: float) -> Callable[[], Tensor]:
+    """This package's image of stpsf's arrays, with so many cells of the occulter per lambda/D."""
+    assert setting.stpsf is not None
+    instrument, call = setting.stpsf
+    model = from_webbpsf(instrument, fft_oversample=4, occulter_sampling=cells, **call)
+    return partial(rendered, model, model.opd(None))

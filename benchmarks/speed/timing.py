@@ -1,14 +1,10 @@
-"""How long things take, and how much memory: side by side, in one process."""
+"""How long things take: side by side, in one process."""
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import math
-import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,32 +68,3 @@ def interleaved(
 def exponent(sizes: Sequence[float], durations: Sequence[float]) -> float:
     """The power of the size with which a duration grows: a straight line through logarithms."""
     return float(np.polyfit(np.log(sizes), np.log(durations), 1)[0])
-
-
-_STATUS, _FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-
-
-def resident(name: str = "VmRSS") -> float:
-    """Bytes of memory that this process holds, or held at most ("VmHWM"); NaN if not Linux."""
-    if not _STATUS.is_file():
-        return math.nan
-    for line in _STATUS.read_text(encoding="utf-8").splitlines():
-        if line.startswith(f"{name}:"):
-            return 1024.0 * float(line.split()[1])
-    return math.nan
-
-
-def give_back() -> None:
-    """Return freed memory to the system (glibc), so that it does not hide what comes next."""
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
-
-
-def start_peak(device: str = "cpu") -> None:
-    """Forget how much memory was held at most."""
-    if torch.device(device).type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-    elif _FORGET.exists():
-        _FORGET.write_text("5", encoding="ascii")
