@@ -12,8 +12,8 @@ and from roll to roll; the star is a few milliarcseconds from the middle of the 
 has an error of 2 % in every pixel, which nobody tells the reduction; pixels are bad, some of them
 without a flag; and there are photon and read noise. With ``--references`` a second, brighter star
 was observed at small dithers. Other numbers of ``--repeat`` have other wavefronts, flat fields,
-bad pixels and noise, and ``--size`` is the side of the fitted square. With ``--age`` the map is so many days old, and the
-wavefront has drifted accordingly.
+bad pixels and noise, and ``--size`` is the side of the fitted square. With ``--age`` the map is so
+many days old, and the wavefront has drifted accordingly.
 
 Prints a row for each case: planets that were found and missed, false candidates, pulls of flux and
 position, scatter of the S/N without the candidates, limits over those for a known star beyond 0.5
@@ -33,7 +33,7 @@ import warnings
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from astropy import units as u
@@ -92,7 +92,7 @@ class Case:
     age: float | None = None
     """Days from the map to the frames, in which the wavefront drifts like a random walk, by 9 nm
     rms in 3.6 days (Feng et al. 2025, section 4); None: two days, in which it drifts by `DRIFT`."""
-    accuracy: str = "full"
+    accuracy: Literal["full", "quick"] = "full"
 
     @property
     def name(self) -> str:
