@@ -376,7 +376,7 @@ def _detection() -> list[Breakage]:
         ),
         Breakage(
             "small-sample", "limits near the star have the small-sample correction",
-            "return np.asarray(stats.t.isf(stats.norm.sf(sigmas), freedom))",
+            "return student_snr(sigmas, freedom)",
             "return np.asarray(sigmas + 0 * freedom)", "error_factor detection",
         ),
         Breakage(
