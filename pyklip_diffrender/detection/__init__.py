@@ -8,6 +8,7 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 
 from __future__ import annotations
 
+from pyklip_diffrender.detection import metrics
 from pyklip_diffrender.detection.association import Hypotheses, Motion, checked_motion
 from pyklip_diffrender.detection.candidates import (
     Candidates,
@@ -61,6 +62,7 @@ __all__ = [
     "has_bright_pixels_beyond",
     "image_hdu",
     "measured_planet",
+    "metrics",
     "recover_planets",
     "require_outer_pixels",
     "sources_at_edges",
