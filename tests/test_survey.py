@@ -606,3 +606,15 @@ def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, m
         # The scenario mounts a small disk or lowers limits, which needs rights that not all have.
         pytest.skip(f"{scenario}: {error}")
     assert said
+
+
+@pytest.mark.parametrize("north", [0.0, 30.0, 265.0])
+def test_injected_planets_are_at_their_position_angle_on_the_sky(north):
+    injection = folders.Injection(1e-5, 0.8, 70.0)
+    x, y = execution._planet(injection, north).offset
+    # The +y axis has the position angle `north`, and +x is 90 degrees clockwise of it on the sky:
+    # west where north is up.
+    up = np.deg2rad(north)
+    east, northward = y * np.sin(up) - x * np.cos(up), y * np.cos(up) + x * np.sin(up)
+    assert np.rad2deg(np.arctan2(east, northward)) == pytest.approx(injection.angle)
+    assert np.hypot(x, y) == pytest.approx(injection.separation)
