@@ -1,5 +1,6 @@
 """Functions that scipy.signal and scipy.stats have, without the time that their imports take."""
 
+import gc
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ import pytest
 from scipy import stats
 from scipy.signal import fftconvolve
 
+from pyklip_diffrender.cli.session import importing
 from pyklip_diffrender.detection import tails
 from pyklip_diffrender.optics.convolution import fft_convolve
 
@@ -42,6 +44,22 @@ def test_reductions_do_not_load_what_takes_long_to_import():
         "heavy = 'scipy.stats', 'scipy.signal', 'photutils', 'matplotlib', 'pyklip', 'dask'\n"
         "assert 'torch' in sys.modules\n"
         "sys.exit(', '.join(name for name in heavy if name in sys.modules) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_collector_is_left_as_it_is_where_libraries_are_loaded():
+    """A frozen object of the caller would never be freed."""
+    assert "torch" in sys.modules
+    frozen = gc.get_freeze_count()
+    with importing():
+        assert gc.isenabled()
+    assert gc.get_freeze_count() == frozen
+    code = (
+        "import gc\nfrom pyklip_diffrender.cli.session import importing\n"
+        "with importing():\n    assert not gc.isenabled()\n    import torch\n"
+        "assert gc.isenabled() and gc.get_freeze_count() > 10_000"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

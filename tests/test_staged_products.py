@@ -149,6 +149,7 @@ def test_a_detection_in_terms_of_astropy(stopped):
     blind = copy.copy(detection)
     vars(blind)["observation"] = replace(detection.observation, header=fits.Header())
     with pytest.raises(IncompatibleSetupError, match="CRVAL1"):
+        # A property, which raises when it is read.
         blind.coordinates  # noqa: B018
 
 

@@ -20,7 +20,7 @@ Position = tuple[float, float]
 
 
 def _circle(position: Position, radius: float) -> CircularAperture:
-    # Imported where it is used, because it takes a fifth of the time of a reduction's imports.
+    # Imported where it is used, because reductions, which do not need it, start sooner.
     from photutils.aperture import CircularAperture
 
     # photutils leaves out centres that lie exactly on an outer edge.

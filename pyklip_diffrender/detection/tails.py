@@ -1,6 +1,6 @@
 """Tails of the normal and of Student's t distribution, and their inverses.
 
-They are from `scipy.special`: `scipy.stats` takes half as long to import as torch.
+They are from `scipy.special`, because `scipy.stats` takes long to import.
 """
 
 from __future__ import annotations

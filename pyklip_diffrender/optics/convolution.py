@@ -15,8 +15,7 @@ def fft_convolve(images: Image, kernel: Image, *, full: bool = False) -> Image:
     The result has the size of the images, or, if `full`, every pixel that light gets to,
     (..., ny + my - 1, nx + mx - 1). A kernel is about its pixel (my - 1) // 2, (mx - 1) // 2.
     """
-    # As scipy.signal.fftconvolve, whose import loads all of scipy.stats: a tenth of the time of a
-    # first look.
+    # As scipy.signal.fftconvolve, whose import loads all of scipy.stats.
     sides = np.array(images.shape[-2:]), np.array(kernel.shape)
     ny, nx = sides[0] + sides[1] - 1
     padded = (next_fast_len(int(ny), real=True), next_fast_len(int(nx), real=True))
