@@ -164,6 +164,40 @@ def test_a_prior_that_is_far_too_narrow_reaches_its_size_at_once(world, caplog):
     assert caplog.text.count("the wavefront is larger than its prior says") == 1
 
 
+def test_a_fit_that_goes_on_widens_its_prior_on_the_way(world, monkeypatch):
+    """The last steps are then not taken with a narrow prior first, and again with a wider one."""
+    likely = world.fitted(4)
+    narrow = WavefrontPrior({n: scale / 3 for n, scale in likely.scales.items()}, fit_scales=False)
+    held = world.refined(world.observed(world.expected(), 4), prior=narrow)
+    assert held.status is Status.PRIOR_MISMATCH
+    monkeypatch.setattr(Annealing, "_with_wider_prior", lambda self, end: end)
+    again = refine_again(held, adapt_prior=True)
+    assert again.status is Status.CONVERGED
+    # As for the prior that a first fit adapts at its end.
+    assert again.scales["segment"] == pytest.approx(likely.scales["segment"], rel=0.15)
+    # Where the noise does not explain the data, the wavefront may not be the reason.
+    monkeypatch.setattr(Annealing, "_unexplained", lambda self, state: 0.01)
+    kept = refine_again(held, adapt_prior=True)
+    assert kept.scales == pytest.approx(narrow.scales)
+
+
+def test_a_step_after_which_the_priors_change_is_not_the_last(world, monkeypatch):
+    """Under other priors, another step may gain more."""
+    held = world.refined(world.observed(world.expected(), 4))
+    measured = []
+
+    def measure(self, course, gain):
+        if not measured:
+            priors = replace(course.carried.priors)
+            course.carried = replace(course.carried, priors=priors)
+        measured.append(gain)
+
+    monkeypatch.setattr(Annealing, "_measure_on_the_way", measure)
+    refine_again(held, adapt_prior=True)
+    assert len(measured) == 2
+    assert measured[0] < held.settings.tolerance
+
+
 def test_a_rough_fit_that_does_not_explain_its_data_goes_on(world, monkeypatch):
     """It ends at a chi-squared of 0.997 per pixel, which is not enough here, and goes on."""
     monkeypatch.setattr(annealing, "_EXPLAINED_CHI2", 0.97)

@@ -13,17 +13,18 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.linear.model import (
-    LinearFrame,
-    Noise,
-)
+from pyklip_diffrender.linear.model import Noise
 from pyklip_diffrender.refinement.forward import (
     Objective,
     State,
 )
 
-_GRADIENT_ITERATIONS = 6
+_GRADIENT_ITERATIONS = 8
+"""Largest number of iterations of one step. Seven settle two rolls and two frames of a reference
+star after their prior was widened; where they do not, new equations take as long as six more."""
+
 _GRADIENT_TOLERANCE = 0.05
+"""Part of the decrease so far below which an iteration is the last."""
 
 _CURVATURE_ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
@@ -34,20 +35,10 @@ matters less than the rounding errors of single precision."""
 
 
 class ModelDerivatives:
-    """Gradient and curvature of chi-squared, by derivatives of the model itself.
+    """Gradient and curvature of chi-squared, by derivatives of the model itself."""
 
-    The curvature has the approximate derivatives of the frames `rough`, by index.
-    """
-
-    def __init__(
-        self,
-        objective: Objective,
-        state: State,
-        noise: Noise,
-        rough: Mapping[int, LinearFrame] | None = None,
-    ) -> None:
+    def __init__(self, objective: Objective, state: State, noise: Noise) -> None:
         self._objective, self._state, self._noise = objective, state, noise
-        self._rough = rough or {}
         self._levels = [
             forward.levels(point, point.unknowns.visible_sources(point.vector)).double()
             for forward, point in zip(objective.forwards, state.points, strict=True)
@@ -66,7 +57,7 @@ class ModelDerivatives:
     def gradient(self) -> Tensor:
         """Minus half the derivative of chi-squared, (unknowns,)."""
         sources = [point.unknowns.visible_sources(point.vector) for point in self._state.points]
-        return self._pull(dict(enumerate(self._objective.residuals(self._state))), sources, {})
+        return self._pull(dict(enumerate(self._objective.residuals(self._state))), sources)
 
     def product(self, step: Tensor) -> Tensor:
         """Product of the curvature with a step, (unknowns,)."""
@@ -75,9 +66,6 @@ class ModelDerivatives:
         vector, images, sources = self._state.vector + _CURVATURE_STEP_RATIO * step, {}, []
         for k, before in enumerate(self._without_faint):
             sources.append(before.unknowns.visible_sources(before.vector)[self._bright[k]])
-            if k in self._rough:
-                images[k] = self._rough[k].image(step).to(before.total.device)
-                continue
             rows, bright = self._state.unknowns.rows[k], self._bright[k]
             after = self._objective.forwards[k].at(
                 before.unknowns, rows.of_unknowns(vector), bright
@@ -85,7 +73,7 @@ class ModelDerivatives:
             images[k] = (after.total - before.total) / _CURVATURE_STEP_RATIO
             if not bool(bright.all()):
                 images[k] = images[k] + self._change_of_faint(k, rows.of_unknowns(step))
-        return self._pull(images, sources, self._rough)
+        return self._pull(images, sources)
 
     def _change_of_faint(self, k: int, step: Tensor) -> Tensor:
         """Change of the light of faint companions in a frame by a step of its unknowns."""
@@ -99,16 +87,10 @@ class ModelDerivatives:
         relative = change_of_flux / unknowns.level("flux", point.vector)
         return relative * light + change.to(light.device)
 
-    def _pull(
-        self,
-        images: Mapping[int, Tensor],
-        sources: Sequence[Tensor],
-        rough: Mapping[int, LinearFrame],
-    ) -> Tensor:
+    def _pull(self, images: Mapping[int, Tensor], sources: Sequence[Tensor]) -> Tensor:
         """Product of the whitened Jacobian with images of all frames, which are whitened here.
 
-        The Jacobian by optics and wavefront includes the star and `sources`, (k, 3) by frame;
-        frames in `rough` have their approximate Jacobian.
+        The Jacobian by optics and wavefront includes the star and `sources`, (k, 3) by frame.
         """
         objective, unknowns = self._objective, self._state.unknowns
         total = torch.zeros(unknowns.size, dtype=torch.float64)
@@ -119,10 +101,6 @@ class ModelDerivatives:
             # `inverse` has C^-1 x over w. Levels and companions have images in `_levels`, and the
             # derivatives by the other unknowns come from reverse mode.
             pixels = self._noise.weight[k] * whitened[k]
-            if k in rough:
-                on_rows = rough[k].pulled(pixels.cpu()[None])
-                total += rough[k].onto_unknowns(on_rows, unknowns.size)[:, 0]
-                continue
             where, levels = point.unknowns.slices, self._levels[k]
             of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
             last = where["companions"].stop

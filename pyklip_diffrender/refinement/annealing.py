@@ -255,9 +255,12 @@ class Annealing:
             while course.remaining and not converged:
                 gain = self._step(course)
                 bar.update(chi2=course.chi2)
+                priors = course.carried.priors
                 if self._is_warm and not self._has_scales:
                     self._measure_on_the_way(course, gain)
-                converged = (self._anneal if course.modes else self._align)(course, gain)
+                settled = (self._anneal if course.modes else self._align)(course, gain)
+                # With other priors a step may gain more than the last one did.
+                converged = settled and course.carried.priors is priors
         end, status = self._finish(replace(self._end_of(course), state=course.best), converged)
         return conclude(
             self.solver,
@@ -461,23 +464,28 @@ class Annealing:
     def _measure_on_the_way(self, course: Course, gain: float) -> None:
         """Measure priors early, and once more, without bad pixels, where steps gain little.
 
-        The sizes of the wavefront and its drift change the solution more than the last steps do.
+        The sizes of the wavefront and its drift change the solution more than the last steps do. A
+        prior is widened only where steps gain little: before, the wavefront is not yet known.
         """
+        gains_little = bool(course.modes) and gain < _STALLED_CHI2_GAIN
         if len(self.history) == _PRIOR_MEASURED_AFTER_STEPS:
-            self._measure_priors(course)
-        elif course.may_settle and course.modes and gain < _STALLED_CHI2_GAIN:
+            self._measure_priors(course, may_widen=gains_little)
+        elif course.may_settle and gains_little:
             course.may_settle = False
             if course.outlier_searches:
                 self._go_on_without_outliers(course)
             if course.modes:
-                self._measure_priors(course)
+                self._measure_priors(course, may_widen=True)
 
-    def _measure_priors(self, course: Course) -> None:
+    def _measure_priors(self, course: Course, may_widen: bool) -> None:
         """Go on with priors of the sizes that the present state of the wavefront shows."""
         end = self._end_of(course)
-        narrowed = self._narrowed(end)
-        if narrowed is not end.settings:
-            end = self._with_settings(end, narrowed)
+        adapted = self._narrowed(end)
+        may_widen = may_widen and self.settings.adapt_prior and not self._unexplained(end.state)
+        if may_widen and adapted is end.settings:
+            adapted = self._widened(end)
+        if adapted is not end.settings:
+            end = self._with_settings(end, adapted)
         end, _ = self._with_drift_of(end)
         counted = self._counted(end)
         if end.settings is not course.settings or counted is not end:

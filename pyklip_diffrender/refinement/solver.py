@@ -269,13 +269,7 @@ class Solver:
             equations = None if is_new else self.equations.preconditioner(state, kappa, modes)
             if equations is None:
                 equations = self.equations.about(state, kappa, modes, objective.robust, ACCURATE)
-            # Frames of reference stars, perhaps many, hardly change the direction.
-            rough = {
-                k: equations.frames[k]
-                for k, forward in enumerate(objective.forwards)
-                if forward.problem.observation.reference
-            }
-            derivatives = ModelDerivatives(objective, state, noise, rough)
+            derivatives = ModelDerivatives(objective, state, noise)
             volume = self._volume_gradient(state, carried.priors, len(equations.curvature))
             step, settled = accurate_step(
                 derivatives, equations.curvature, offset, deviation, enough, volume=volume
