@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -25,9 +25,6 @@ from benchmarks.synthetic_searches import searched, write_searched
 from pyklip_diffrender import errors
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.cli.session import Run
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import Preparation, ProductFolder, ReduceOptions
 from pyklip_diffrender.surveys import execution
 from pyklip_diffrender.wavefront.opd import random_opd
@@ -47,7 +44,7 @@ def opd_file(path):
     return path
 
 
-@pytest.mark.parametrize("command", ["demo", "reduce", "detect", "psf"])
+@pytest.mark.parametrize("command", ["demo", "reduce", "learn"])
 def test_help_of_a_command_has_sections_and_examples(capsys, command):
     assert main([command, "-h"]) == 0
     shown = capsys.readouterr().out
@@ -61,18 +58,18 @@ def test_help_of_a_command_has_sections_and_examples(capsys, command):
         ([], "Commands:"),
         (["fit"], "No such command 'fit'"),
         (["reduce", "-o", "x", "--opd", "y"], "Missing argument 'FRAMES...'"),
-        (["detect", "x", "--opd", "y"], "Missing option '-o'"),
-        (["detect", "x", "-o", "y"], "'--opd'. Name the FITS file of an OPD map"),
+        (["reduce", "x", "--opd", "y"], "Missing option '-o'"),
+        (["reduce", "x", "-o", "y"], "'--opd'. Name the FITS file of an OPD map"),
         (["learn", "x", "-o", "y"], "flat to start without one"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--opd-date", "closest"], "nearest"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--threshold", "-3"], "threshold: got -3"),
+        (["reduce", "x", "-o", "y", "--opd", "z", "--opd-date", "closest"], "nearest"),
+        (["reduce", "x", "-o", "y", "--opd", "z", "--threshold", "-3"], "threshold: got -3"),
         (["reduce", "x", "-o", "y", "--opd", "z", "--star", "12"], "'12', expected x,y"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--disk", "--wide"], "wide, disk: got both"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--pattern", "no.fits"], "pattern: got"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--opd-folder", "x"], "--opd-folder"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--dry-run", "--json"], "--dry-run has no"),
-        (["psf", "-o", "x.fits", "--threads", "0"], "--threads"),
-        (["psf", "-o", "x.fits", "--size", "0"], "--size"),
+        (["reduce", "x", "-o", "y", "--opd", "z", "--disk", "--wide"], "wide, disk: got both"),
+        (["reduce", "x", "-o", "y", "--opd", "z", "--pattern", "no.fits"], "pattern: got"),
+        (["reduce", "x", "-o", "y", "--opd", "z", "--opd-folder", "x"], "--opd-folder"),
+        (["reduce", "x", "-o", "y", "--opd", "z", "--dry-run", "--json"], "--dry-run has no"),
+        (["demo", "--threads", "0"], "--threads"),
+        (["learn", "x", "-o", "y", "--opd", "z", "--size", "0"], "--size"),
         (["demo", "--hours", "-1"], "--hours"),
         (["demo", "--contrast", "-1"], "--contrast"),
         (["demo", "--separation", "9"], "--separation"),
@@ -87,53 +84,18 @@ def test_wrong_options_are_usage_errors(tmp_path, monkeypatch, capsys, arguments
     assert list(tmp_path.iterdir()) == []
 
 
-def test_psf_writes_the_image_of_the_model(tmp_path, capsys, monkeypatch):
-    small = partial(nircam_coronagraph, npix=192)  # The command has 1024, which takes seconds.
-    monkeypatch.setattr("pyklip_diffrender.instrument.nircam.nircam_coronagraph", small)
-    path = tmp_path / "star.fits"
-    opd = opd_file(tmp_path / "opd.fits")
-    arguments = f"psf -o {path} --monochromatic 4.5e-6 --size 20 --opd {opd}".split()
-    path.write_text("mine")
-    assert main(arguments) == 1
-    assert re.search(rf"{re.escape(str(path))}.*option overwrite", capsys.readouterr().err)
-    assert path.read_text() == "mine"
-    assert main([*arguments, "--overwrite", "--offset", "0.02", "-0.3"]) == 0
-    assert str(path) in capsys.readouterr().out
-    with open_fits(path) as hdus:
-        image, header = hdus[0].data, hdus[0].header
-    wanted = {
-        "FILTER": "F444W", "CORONMSK": "MASK335R", "PUPIL": "MASKRND", "STAROFFX": 0.02,
-        "STAROFFY": -0.3, "PUPILOPD": "opd.fits", "WAVELEN": 4.5e-6,
-    }  # fmt: skip
-    assert {name: header[name] for name in wanted} == wanted
-    assert header["PIXELSCL"] == pytest.approx(0.062424185)
-    with torch.no_grad():
-        model = small("F444W", monochromatic=4.5e-6, fov_pixels=20)
-        expected = model(resample(1e-9 * wavefront(), 192), (0.02, -0.3)).numpy()
-    np.testing.assert_allclose(image, expected, rtol=1e-9)
-    # The star is below the middle, as asked for.
-    assert np.unravel_index(image.argmax(), image.shape)[0] < 9
-    assert not np.allclose(image, expected[::-1], rtol=0.1)
-
-
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["--filter", "F090W"], ["F090W", "F200W", "F444W"]),
-        (["--monochromatic", "4.5"], ["monochromatic: 4.5", "metres"]),
-        (["--mask", "MASK9"], ["image_mask: got 'MASK9'", "MASK335R"]),
-        (["--offset", "nan", "0"], ["--offset: got nan 0", "inside the image"]),
-        (["--offset", "0", "2.6"], ["--offset: got 0 2.6", "--size"]),
-        (["--opd", "nowhere.fits"], ["nowhere.fits", "no such file"]),
+        ([], ["nowhere.fits", "no such file"]),
         (["--device", "abacus"], ["--device: PyTorch"]),
-        (["-o", "nowhere/star.fits"], ["there is no folder"]),
+        (["-o", "nowhere/library.fits"], ["there is no folder"]),
         (["-o", "."], ["is a folder, expected a file"]),
     ],
-    ids=lambda value: " ".join(value[:2]) if value[0].startswith("-") else "",
 )
 def test_errors_go_to_stderr_and_nothing_is_written(tmp_path, monkeypatch, capsys, extra, words):
     monkeypatch.chdir(tmp_path)
-    assert main(["psf", "-o", "star.fits", *extra]) == 1
+    assert main(["learn", "nowhere.fits", "--opd", "flat", "-o", "library.fits", *extra]) == 1
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.startswith("pyklip-diffrender: ")
@@ -141,16 +103,16 @@ def test_errors_go_to_stderr_and_nothing_is_written(tmp_path, monkeypatch, capsy
     assert list(tmp_path.iterdir()) == []
 
 
-def test_detect_in_a_broken_file_leaves_no_product(tmp_path, capsys):
+def test_a_broken_file_leaves_no_product(tmp_path, capsys):
     frames, products = calints(tmp_path / "calints.fits", np.ones((2, 90, 90))), tmp_path / "out"
     frames.write_bytes(frames.read_bytes()[: frames.stat().st_size // 2])
     opd = opd_file(tmp_path / "opd.fits")
-    assert main(["detect", str(frames), "--opd", str(opd), "-o", str(products)]) == 1
+    assert main(["reduce", str(frames), "--opd", str(opd), "-o", str(products)]) == 1
     assert "calints.fits" in capsys.readouterr().err
     assert not products.exists()
 
 
-@pytest.mark.parametrize("command", ["demo", "reduce", "detect"])
+@pytest.mark.parametrize("command", ["demo", "reduce"])
 def test_products_are_refused_before_any_work(tmp_path, capsys, command):
     """The frames do not exist: had they been opened first, the message would be theirs."""
     arguments = [command, "-o", str(tmp_path)]
@@ -211,7 +173,8 @@ class Broken(io.StringIO):
 def test_a_program_without_standard_streams_ends_as_with_them(monkeypatch, capsys, stream):
     monkeypatch.setattr(sys, "stdout", stream())
     monkeypatch.setattr(sys, "stderr", stream())
-    for arguments, status in ((["--help"], 0), (["psf", "-o", "no/such/star.fits"], 1), (["x"], 2)):
+    failing = ["learn", "x", "--opd", "flat", "-o", "no/such/library.fits"]
+    for arguments, status in ((["--help"], 0), (failing, 1), (["x"], 2)):
         assert main(arguments) == status
 
 
@@ -263,7 +226,7 @@ def reducing(tmp_path, frames, maps):
 @pytest.fixture
 def detecting(frames, reducing):
     """The same of the target's file alone."""
-    return ["detect", str(frames / "one_calints.fits"), *reducing[2:]]
+    return ["reduce", str(frames / "one_calints.fits"), *reducing[2:]]
 
 
 @pytest.mark.parametrize("name", ["x_asn.json", "o*_calints.fits"])

@@ -135,13 +135,6 @@ def _star_callback(
     return x, y
 
 
-_STAR = option(
-    "--star", metavar="X,Y", section="Frames", callback=_star_callback,
-    help="Where the target's star is in its files, pixels from 0, in place of what the headers say "
-         "and whatever else the frames show.",
-)  # fmt: skip
-
-
 @click.command(
     "reduce",
     cls=Command,
@@ -150,6 +143,7 @@ Examples:
   pyklip-diffrender reduce frames --opd maps -o products
   pyklip-diffrender reduce frames --target G-7-34 --filter F444W --opd map.fits -o products
   pyklip-diffrender reduce frames --opd maps -o products --dry-run
+  pyklip-diffrender reduce calints.fits --opd maps -o products --json | jq .sentence
   pyklip-diffrender reduce --program 1184 --target G-7-34 --filter F444W --opd map.fits -o out""",
 )
 @click.argument("frames", type=file_type(), nargs=-1)
@@ -161,7 +155,11 @@ Examples:
     section="Frames",
     help="Which filter; default: all of the target's, one by one.",
 )
-@_STAR
+@option(
+    "--star", metavar="X,Y", section="Frames", callback=_star_callback,
+    help="Where the target's star is in its files, pixels from 0, in place of what the headers say "
+         "and whatever else the frames show.",
+)  # fmt: skip
 @archive
 @wavefront
 @search
@@ -205,113 +203,6 @@ def reduce_frames(
         from pyklip_diffrender.cli.reducing import run_reduction
 
     run_reduction(run, read, **options)
-
-
-@click.command(
-    "detect",
-    cls=Command,
-    epilog="""\b
-Examples:
-  pyklip-diffrender detect calints.fits --opd map.fits -o products
-  pyklip-diffrender detect calints.fits --opd maps --opd-date before -o products
-  pyklip-diffrender detect calints.fits --opd maps -o products --json | jq .sentence""",
-)
-@click.argument("frames", type=file_type())
-@_STAR
-@wavefront
-@search
-@outputs()
-@click.pass_obj
-def detect_in_file(
-    run: Run, /, frames: Path, star: tuple[float, float] | None, **options: Any
-) -> None:
-    """Subtract the star from a single file and search for planets.
-
-    FRAMES is a calints file.
-    """
-
-    def read() -> tuple[ExposureSequence, ...]:
-        from pyklip_diffrender.scene.sequence import ExposureSequence
-
-        if frames.is_dir():
-            raise IncompatibleSetupError(
-                f"{frames} is a folder, expected a file; the command reduce takes folders"
-            )
-        return (ExposureSequence.from_files([frames], star=star),)
-
-    with importing():
-        from pyklip_diffrender.cli.reducing import run_reduction
-
-    run_reduction(run, read, **options)
-
-
-@click.command(
-    cls=Command,
-    epilog="""\b
-Examples:
-  pyklip-diffrender psf --filter F356W --offset 0.02 0 -o star.fits
-  pyklip-diffrender psf --filter F460M --mask MASKLWB -o star.fits
-  pyklip-diffrender psf --monochromatic 4.5e-6 --opd map.fits -o star.fits""",
-)
-@option("--filter", default="F444W", show_default=True, metavar="NAME", help="Filter of NIRCam.")
-@option("--mask", default="MASK335R", show_default=True, metavar="NAME",
-        help="Coronagraph mask of NIRCam.")  # fmt: skip
-@option("--monochromatic", type=float, metavar="M", help="A single wavelength, m.")
-@option("--opd", default="flat", show_default=True, metavar="FILE|flat",
-        help="OPD map: a FITS file, or flat.")  # fmt: skip
-@option("--size", type=click.IntRange(min=1), default=80, show_default=True, metavar="N",
-        help="Side of the image, pixels.")  # fmt: skip
-@option("--offset", type=float, nargs=2, default=(0.0, 0.0), show_default=True,
-        metavar="X Y", help="Star from the occulter's centre, arcsec.")  # fmt: skip
-@outputs(file="The FITS file to write.")
-@click.pass_obj
-def psf(
-    run: Run,
-    output: Path,
-    filter: str,
-    mask: str,
-    monochromatic: float | None,
-    opd: str,
-    size: int,
-    offset: tuple[float, float],
-    overwrite: bool,
-) -> None:
-    """Write the image of a star behind the coronagraph."""
-    run.claim_file(output)
-    from pyklip_diffrender.io.files import require_new, write_fits
-
-    require_new([output], overwrite)
-    import numpy as np
-    from astropy.io import fits
-
-    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.io.headers import fits_text
-    from pyklip_diffrender.optics.grid import resample
-    from pyklip_diffrender.wavefront.opd import as_opd_map
-
-    model = nircam_coronagraph(
-        filter,
-        image_mask=mask,
-        monochromatic=monochromatic,
-        fov_pixels=size,
-        device=run.device,
-    )
-    edge = size / 2 * min(model.detector.pixelscale)
-    if not np.abs(offset).max() < edge:
-        raise IncompatibleSetupError(
-            f"--offset: got {offset[0]:g} {offset[1]:g}, expected a star inside the image, less "
-            f"than {edge:.3g} arcsec from its centre along x and y. Choose a larger --size"
-        )
-    map_ = as_opd_map(opd)
-    pixels = model.calc_psf(opd=resample(map_.data, model.npix), star_offset=offset)["DET_SAMP"]
-    hdu = fits.PrimaryHDU(pixels.data, pixels.header)
-    del hdu.header["EXTNAME"]
-    hdu.header["BUNIT"] = ("", "fraction of the light that the pupil collects")
-    hdu.header["PUPILOPD"] = (fits_text(map_.name), "Pupil OPD source")
-    hdu.header["STAROFFX"] = (offset[0], "x of the star from the mask's centre, arcsec")
-    hdu.header["STAROFFY"] = (offset[1], "y of the star from the mask's centre, arcsec")
-    write_fits(fits.HDUList([hdu]), output)
-    click.echo(f"wrote {output}")
 
 
 @click.command(
@@ -593,10 +484,8 @@ def application(**_: Any) -> None:
 for _command in (
     demo,
     reduce_frames,
-    detect_in_file,
     learn,
     survey,
-    psf,
     doctor,
 ):
     application.add_command(_command)

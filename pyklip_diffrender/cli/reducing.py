@@ -1,4 +1,4 @@
-"""The work of the commands `reduce`, `detect` and `survey`."""
+"""The work of the commands `reduce` and `survey`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_opd
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
-# The work of the commands `reduce` and `detect`.
+# The work of the command `reduce`.
 
 _MAST = "mast"
 """Value of --opd for maps that come from MAST."""
@@ -101,9 +101,9 @@ def run_reduction(
     dry_run: bool,
     derivatives: bool,
     figures: Literal["pdf", "png", "svg"] | None,
-    spectra: tuple[str, ...] = (),
-    proper_motion: tuple[str, str] | None = None,
-    parallax: str | None = None,
+    spectra: tuple[str, ...],
+    proper_motion: tuple[str, str] | None,
+    parallax: str | None,
     **options: Any,
 ) -> None:
     """Reduce the epochs and filters of a target, write all products and say what they show.
