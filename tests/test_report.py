@@ -420,7 +420,7 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
     page = Tags((folder / "report.html").read_text(encoding="utf-8"))
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
     # Three of the whole, the curve, two of the candidate, three of the frame and of the wavefront.
-    assert len(pictures) == 12
+    assert len(pictures) == 11
     for attributes in pictures:
         assert len(attributes["alt"] or "") > 30
         assert (attributes["src"] or "").startswith("data:image/png;base64,")
@@ -442,7 +442,7 @@ def test_a_header_cannot_write_into_the_page(tmp_path):
     assert text.count(str(escape(HOSTILE))) > 8
     tags = Tags(text).tags
     assert not [tag for tag, attributes in tags if tag == "script" or "onerror" in attributes]
-    assert len([tag for tag, _ in tags if tag == "img"]) == 12
+    assert len([tag for tag, _ in tags if tag == "img"]) == 11
     assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
 
 
@@ -643,7 +643,7 @@ def test_every_figure_is_a_file_of_its_own(tmp_path):
     written = whole.write(tmp_path, figures="pdf")
     drawn = sorted(path for path in written if path.parent.name == "figures")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert len(drawn) == text.count("<figure>") == 12
+    assert len(drawn) == text.count("<figure>") == 11
     assert all(path.read_bytes().startswith(b"%PDF") for path in drawn)
     assert 'href="figures/"' in text
     mine = tmp_path / "figures" / "mine.pdf"

@@ -29,7 +29,7 @@ from pyklip_diffrender.imaging import SkyModel
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.units import rotation_matrix
-from pyklip_diffrender.reduction.pages import Picture, number, plus_minus
+from pyklip_diffrender.reduction.pages import Picture, number
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.scene.observation import Window
@@ -399,11 +399,10 @@ def _curve(
 
 
 def _candidate(detection: Detection, place: int) -> list[Picture]:
-    """Pixels in every frame, flux and position of a candidate, by its place in the table."""
+    """Pixels of a candidate in every frame, by its place in the table."""
     number = place + 1
     unit = drawing.unit_label(detection.observation.unit)
-    stamps = _stamps(detection, place)
-    pictures = [
+    return [
         Picture(
             f"candidate_{number}_frame_{frame}",
             drawing.stamp_panels(stamp, unit),
@@ -411,26 +410,8 @@ def _candidate(detection: Detection, place: int) -> list[Picture]:
             "background and other candidates; the model of the source, on the same scale; and what "
             "is left, in standard deviations of the noise. The cross marks the fitted position.",
         )
-        for frame, stamp in stamps.items()
+        for frame, stamp in _stamps(detection, place).items()
     ]
-    names, values, covariance = _measured(detection, place)
-    power = int(np.floor(np.log10(values[0])))
-    scale = np.array([10.0**-power, 1e3, 1e3])
-    values, covariance = scale * values, np.outer(scale, scale) * covariance
-    errors = np.sqrt(np.diagonal(covariance))
-    titles = [plus_minus(value, error) for value, error in zip(values, errors, strict=True)]
-    figure = drawing.corner(
-        [rf"contrast ($10^{{{power}}}$)", *(f"{each} (mas)" for each in names)],
-        values, covariance, titles,
-    )  # fmt: skip
-    corner = Picture(
-        f"candidate_{number}_corner",
-        figure,
-        f"Contrast and position of candidate {number} by the covariance of the fit, with the star "
-        "and the other candidates marginalised. Ellipses have one and two standard deviations, 39 "
-        "and 86 % of the probability. Errors include the star's flux and position.",
-    )
-    return [*pictures, corner]
 
 
 def _roll(north: float | None) -> str:
@@ -480,27 +461,6 @@ def _stamps(detection: Detection, place: int) -> dict[int, drawing.Stamp]:
         )  # fmt: skip
         stamps[shown] = drawing.Stamp(x, y, data, left, model, noise, observation.north)
     return stamps
-
-
-def _measured(
-    detection: Detection, place: int
-) -> tuple[tuple[str, str], NDArray[np.float64], NDArray[np.float64]]:
-    """Contrast and offset (3,) of a candidate, arcsec, with their names and covariance (3, 3).
-
-    The offset is to the east and north where the orientation is known, else x and y.
-    """
-    row = detection.candidates[place]
-    is_known = "delta_ra" in row.colnames
-    offset = ("delta_ra", "delta_dec") if is_known else ("x", "y")
-    short = ("ra", "dec") if is_known else ("x", "y")
-    values = np.array([row["contrast"], *(row[each].value for each in offset)])
-    errors = np.array([row["contrast_error"], *(row[f"{each}_error"].value for each in offset)])
-    upper = np.zeros((3, 3))
-    upper[np.triu_indices(3, 1)] = [
-        *(row[f"contrast_{each}_corr"] for each in short), row[f"{''.join(short)}_corr"]
-    ]  # fmt: skip
-    covariance = np.outer(errors, errors) * (np.eye(3) + upper + upper.T)
-    return (("ΔRA cos Dec", "ΔDec") if is_known else offset), values, covariance
 
 
 def _scaled(detection: Detection) -> str:

@@ -236,7 +236,7 @@ _FIGURES = "figures"
 """Folder of the figures, in the folder of the products."""
 
 _FIGURE = re.compile(
-    r"(without_star|klip|most_probable|snr|contrast_curve|candidate_\d+_(frame_\d+|corner)"
+    r"(without_star|klip|most_probable|snr|contrast_curve|candidate_\d+_frame_\d+"
     r"|whole_frames_(snr|contrast_curve)|extended_light(_model)?|injected_planets|completeness"
     r"|frame_\d+_(data|model|residual)|wavefront_(before|after|change))"
     rf"\.({'|'.join(FIGURE_FORMATS)})"
