@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,6 @@ from pyklip_diffrender.io.files import OutputFolder, read_text, replacing, write
 from pyklip_diffrender.reduction.pages import (
     FIGURE_FORMATS,
     count,
-    depth_against_klip,
     number,
     plus_minus,
     remark_on_map,
@@ -59,12 +58,10 @@ def page(
         sky_columns=[each for each in _SKY_COLUMNS if first and each.key in first[0]],
         photometry=_PHOTOMETRY,
         outside=0 if wide is None else len(wide["candidates"]) - len(summary["candidates"]),
-        deeper=depth_against_klip(summary["contrast_curve"], summary["klip_curve"]),
         age=_age(summary["opd"]["days_before_first_frame"]),
         map_remark=remark_on_map(summary["opd"]["days_before_first_frame"]),
         left_out=by_reason((each["name"], each["reason"]) for each in summary["left_out"]),
         provenance=_provenance(summary),
-        settings=list(_flat(summary["settings"])),
     )
 
 
@@ -178,28 +175,6 @@ def _provenance(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Software", ", ".join(" ".join(each) for each in summary["versions"].items())),
         ("SHA-256 of the OPD map", str(summary["opd"]["sha256"])),
     ]
-
-
-def _flat(settings: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, str]]:
-    """Names and values of settings; settings in settings have both names."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{within}{name}.")
-        else:
-            yield f"{within}{name}", _setting(value)
-
-
-def _setting(value: Any) -> str:
-    """A value as one would write it in a table."""
-    if value is None:
-        return "default"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        return str(value)
-    return ", ".join(_setting(each) for each in value) or "none"
 
 
 _SMALL_CHI2 = 0.9
