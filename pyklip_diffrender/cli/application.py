@@ -7,7 +7,7 @@ import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,14 +19,14 @@ from pyklip_diffrender.cli.session import (
     Command,
     Run,
     archive,
+    claim_file,
+    claim_folder,
     common,
     declared,
     file_type,
-    free_memory,
     importing,
     keep_freed_memory,
     named_files,
-    open_streams,
     option,
     outputs,
     require_frames,
@@ -35,7 +35,7 @@ from pyklip_diffrender.cli.session import (
     together,
     wavefront,
 )
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, RefinementError
+from pyklip_diffrender.errors import DiffrenderError, RefinementError
 
 if TYPE_CHECKING:
     from pyklip_diffrender.scene.sequence import ExposureSequence
@@ -77,7 +77,7 @@ def demo(
     Needs no data, half a minute and 2 GB of memory.
     """
     products = named_files(output, _DEMO, overwrite)
-    run.claim_folder(output, _DEMO)
+    claim_folder(output, _DEMO)
     with importing():
         from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
         from pyklip_diffrender.drawing import save
@@ -307,7 +307,7 @@ def learn(
     same command goes on where an earlier one was stopped.
     """
     require_frames(frames, program)
-    run.claim_file(output)
+    claim_file(output)
     products = named_files(output.parent, (output.name,), overwrite)
     from pyklip_diffrender.archive import fetch_calints
     from pyklip_diffrender.cli.reducing import opd_of
@@ -369,33 +369,14 @@ def check_data() -> str:
     return f"{len(package_library().patterns)} detector patterns"
 
 
-def check_stpsf() -> str:
-    """Look for stpsf, which is optional, and its data."""
-    try:
-        name = f"stpsf {version('stpsf')}"
-    except PackageNotFoundError:
-        return "without stpsf, which only bridges and maps from MAST need"
-    folder = os.environ.get("STPSF_PATH") or os.environ.get("WEBBPSF_PATH")
-    if not folder:
-        return f"{name}, without its data: STPSF_PATH is not set"
-    if not Path(folder, "version.txt").is_file():
-        raise IncompatibleSetupError(
-            f"STPSF_PATH: got {folder}, expected the folder with the data files of {name}, which "
-            "has a version.txt. Set it, or unset it"
-        )
-    return f"{name}, with data in {folder}"
-
-
 def check_machine() -> str:
-    """Look at processors, GPUs and memory."""
+    """Look at processors and GPUs."""
     import torch
 
     gpus = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
-    free = free_memory()
     return (
         f"{torch.get_num_threads()} threads on {os.cpu_count()} processors, "
         f"{', '.join(gpus) or 'no GPU'}"
-        + ("" if free is None else f", {free / 1e9:.1f} GB of memory are free")
     )
 
 
@@ -440,7 +421,6 @@ def check_fit(**settings: Any) -> str:
 CHECKS: tuple[Callable[[], str], ...] = (
     check_libraries,
     check_data,
-    check_stpsf,
     check_machine,
     check_fit,
 )
@@ -501,14 +481,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     keep_freed_memory()
     run = Run()
-    with open_streams(), run.messages():
+    with run.messages():
         try:
             status = application.main(arguments, prog_name=PROGRAM, standalone_mode=False, obj=run)
         except click.ClickException as error:
             error.show()
             return error.exit_code
         except (click.Abort, KeyboardInterrupt):
-            _log.error("interrupted; %s", run.left())
+            _log.error("interrupted; products that were written are complete")
             return 130
         except (DiffrenderError, OSError) as error:
             _log.error("%s", error)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import click
 
-from pyklip_diffrender.cli.session import Run, named_files, require_in_place
+from pyklip_diffrender.cli.session import Run, claim_folder, named_files, require_in_place
 from pyklip_diffrender.detection import COMBINED, Combination, checked_motion
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
@@ -115,7 +115,7 @@ def run_reduction(
         "derivatives": derivatives, "figures": figures, "overwrite": overwrite,
     }  # fmt: skip
     whole = ProductFolder(output, **writing)
-    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
+    claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
     above = named_files(output, (*COMPARISON, *COMBINED), overwrite)
     earlier = [ProductFolder(each, overwrite=True) for each in _listed(output)]
     # Libraries may print, too.
@@ -130,7 +130,7 @@ def run_reduction(
         prepared = []
         for sequence, folder in zip(sequences, folders, strict=True):
             if several:
-                run.claim_folder(folder, tuple(PRODUCTS))
+                claim_folder(folder, tuple(PRODUCTS))
                 click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
             prepared.append(start.prepared(sequence))
         if dry_run:

@@ -24,7 +24,7 @@ from pyklip_diffrender.options import OPTIONS, ReduceOptions
 if TYPE_CHECKING:
     from pyklip_diffrender.io.files import OutputFolder
 
-# Memory of this process, and what the machine has left.
+# Memory of this process.
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Parameters of glibc's ``mallopt``, from its header ``malloc.h``."""
@@ -67,20 +67,6 @@ def importing() -> Iterator[None]:
         gc.enable()
 
 
-def free_memory() -> float | None:
-    """Bytes of memory that a new process could use; None where the system does not say."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        kilobytes = next(line for line in lines if line.startswith("MemAvailable")).split()[1]
-        return 1024.0 * int(kilobytes)
-    except (OSError, StopIteration):
-        pass
-    try:
-        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, OSError, ValueError):
-        return None
-
-
 # Parts of all commands: messages and the log, outputs that may be written, the device.
 
 PROGRAM = "pyklip-diffrender"
@@ -104,35 +90,6 @@ class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
         return f"{PROGRAM}: {warning}{message}"
 
 
-def _takes_text(stream: Any) -> bool:
-    """Whether a standard stream exists and is open: under ``pythonw`` there is none."""
-    if stream is None or stream.closed:
-        return False
-    try:
-        stream.flush()
-    except (OSError, ValueError):
-        return False
-    return True
-
-
-@contextmanager
-def open_streams() -> Iterator[None]:
-    """Put an empty file in place of standard streams that are missing or closed."""
-    # Without them, as under ``pythonw``, in a job of a scheduler or after ``2>&-``, the first
-    # message or progress bar would end the program.
-    before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
-    with open(os.devnull, "w", encoding="utf-8") as nowhere:
-        try:
-            for name, stream in before.items():
-                if not _takes_text(stream):
-                    setattr(sys, name, nowhere)
-            yield
-        finally:
-            for name, stream in before.items():
-                if getattr(sys, name) is nowhere:
-                    setattr(sys, name, stream)
-
-
 _LEAST_ROOM_BYTES = 1e8
 """Room for the products of two rolls of 80 x 80 pixels, which take 30 MB, and of more frames."""
 
@@ -145,8 +102,6 @@ class Run:
     progress: bool = False
     # Device of PyTorch.
     device: str = ReduceOptions.device
-    _output: Path | None = None
-    _before: dict[Path, int] = field(default_factory=dict)
     _handlers: list[logging.Handler] = field(default_factory=list)
 
     @contextmanager
@@ -208,48 +163,40 @@ class Run:
         logging.getLogger().addHandler(handler)
         self._handlers.append(handler)
 
-    def claim_folder(self, folder: Path, products: tuple[str, ...]) -> None:
-        """Raise IncompatibleSetupError if products cannot be written."""
-        _require_no_broken_link(folder, "--output")
-        for name in products:
-            _require_no_broken_link(folder / name, "--output")
-        self._claim(folder, _existing(folder))
 
-    def claim_file(self, path: Path) -> None:
-        """Raise IncompatibleSetupError if a file cannot be written."""
-        _require_no_broken_link(path, "OUTPUT")
-        if not path.absolute().parent.is_dir():
-            raise IncompatibleSetupError(
-                f"--output: there is no folder {path.parent} to write into"
-            )
-        if path.is_dir():
-            raise IncompatibleSetupError(f"--output: {path} is a folder, expected a file")
-        self._claim(path, path.absolute().parent)
+def claim_folder(folder: Path, products: tuple[str, ...]) -> None:
+    """Raise IncompatibleSetupError if products cannot be written."""
+    _require_no_broken_link(folder, "--output")
+    for name in products:
+        _require_no_broken_link(folder / name, "--output")
+    _require_room(folder, _existing(folder))
 
-    def _claim(self, output: Path, folder: Path) -> None:
-        if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
-            raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
-        disk = shutil.disk_usage(folder)
-        if not disk.total:
-            raise IncompatibleSetupError(
-                f"{output} cannot be written: {folder} is of the system, and takes no files. "
-                "Choose another place"
-            )
-        if disk.free < _LEAST_ROOM_BYTES:
-            raise IncompatibleSetupError(
-                f"{output}: got {disk.free / 1e6:.0f} MB of room on the disk, expected at least "
-                f"{_LEAST_ROOM_BYTES / 1e6:.0f} MB. Make room, or choose another place"
-            )
-        self._output, self._before = output, _files(output)
 
-    def left(self) -> str:
-        """Files that an interrupted run has left, as a sentence."""
-        output = self._output
-        written = [] if output is None else _files(output).items() - self._before.items()
-        if not written:
-            return "nothing was written"
-        names = sorted(path.name for path, _ in written)
-        return f"these files in {output} are new and complete: {', '.join(names)}"
+def claim_file(path: Path) -> None:
+    """Raise IncompatibleSetupError if a file cannot be written."""
+    _require_no_broken_link(path, "OUTPUT")
+    if not path.absolute().parent.is_dir():
+        raise IncompatibleSetupError(f"--output: there is no folder {path.parent} to write into")
+    if path.is_dir():
+        raise IncompatibleSetupError(f"--output: {path} is a folder, expected a file")
+    _require_room(path, path.absolute().parent)
+
+
+def _require_room(output: Path, folder: Path) -> None:
+    """Raise IncompatibleSetupError if an output cannot be written to a folder, or has no room."""
+    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+        raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
+    disk = shutil.disk_usage(folder)
+    if not disk.total:
+        raise IncompatibleSetupError(
+            f"{output} cannot be written: {folder} is of the system, and takes no files. "
+            "Choose another place"
+        )
+    if disk.free < _LEAST_ROOM_BYTES:
+        raise IncompatibleSetupError(
+            f"{output}: got {disk.free / 1e6:.0f} MB of room on the disk, expected at least "
+            f"{_LEAST_ROOM_BYTES / 1e6:.0f} MB. Make room, or choose another place"
+        )
 
 
 def named_files(folder: Path, names: tuple[str, ...], overwrite: bool) -> OutputFolder:
@@ -287,16 +234,6 @@ def _require_no_broken_link(path: Path, option: str) -> None:
 def _existing(folder: Path) -> Path:
     """The folder, or the nearest one above it that exists."""
     return next(path for path in (folder, *folder.absolute().parents) if path.exists())
-
-
-def _files(output: Path) -> dict[Path, int]:
-    """Files and the times at which they were written; temporary ones have a dot."""
-    inside = output.iterdir() if output.is_dir() else [output]
-    return {
-        path: path.stat().st_mtime_ns
-        for path in inside
-        if path.is_file() and not path.name.startswith(".")
-    }
 
 
 def _require_device(name: str) -> None:
