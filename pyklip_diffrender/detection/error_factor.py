@@ -197,11 +197,6 @@ class ErrorFactor:
         return bool(np.isfinite(self.freedom).any())
 
     @property
-    def is_needed(self) -> bool:
-        """Whether any errors are multiplied by more than 1."""
-        return bool(self.factors.max() > 1)
-
-    @property
     def typical(self) -> float:
         """Median over the field."""
         return float(np.median(self.factors))

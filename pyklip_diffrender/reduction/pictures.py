@@ -236,25 +236,6 @@ class Overview:
         ax.set_xlim((-half, half) if north is None else (half, -half))
         ax.set_ylim(-half, half)
 
-    def kept(self, separations: Sequence[float]) -> tuple[Image, Image | None]:
-        """Fractions of a faint source's light that the image and KLIP leave at separations.
-
-        Medians of rings a resolution element wide; KLIP's are for its best numbers of modes.
-        """
-        resolution = self._detection.contrast_curve.meta["resolution_arcsec"]
-        distance = np.hypot(*np.moveaxis(self.images.grid, -1, 0))
-        kept = self.images.throughput
-        ours = [
-            np.nanmedian(kept[np.abs(distance - each) < resolution / 2]) for each in separations
-        ]
-        if self.klip is None:
-            return np.array(ours), None
-        curve = self.klip.curve
-        theirs = np.interp(
-            separations, curve["separation"].value, curve["throughput"], np.nan, np.nan
-        )
-        return np.array(ours), np.asarray(theirs)
-
     def figure(self) -> Any:
         """One figure of the panels but the most probable image, and the contrast curve."""
         panels = [each for each in self.panels if each != "most_probable"]
@@ -325,19 +306,12 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'}"
     some += f" above S/N {summary['threshold_snr']:g}"
     up = "north up" if summary["oriented"] else "oriented like the first frame"
-    separations = [row["separation_arcsec"] for row in summary["limits"]]
-    ours, theirs = overview.kept(separations)
-    fitted = (
-        "A candidate, which was fitted together with the star, keeps all of its light. "
-        "Circles mark the candidates. "
-        if count
-        else ""
-    )
     words = {
         "without_star": (
-            f"Mean of all frames minus the star, {up}. "
-            f"{_kept('A faint source keeps', ours, separations, ' (THROUGHPUT in images.fits)')}"
-            f"{fitted}The scale is linear near 0 and logarithmic beyond."
+            f"Mean of all frames minus the star, {up}. THROUGHPUT in images.fits is the part of "
+            "the light of a faint source that is left; circles mark candidates, which were fitted "
+            "together with the star and keep all of their light. The scale is linear near 0 and "
+            "logarithmic beyond."
         ),
         "most_probable": (
             f"Most probable image of the sky without star and detector, {up}, from all frames and "
@@ -346,28 +320,12 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
         ),
         "snr": f"S/N of a point source at every pixel, {some}. The scale is linear within ±5.",
     }
-    if overview.klip is not None and theirs is not None:
-        words["klip"] = (
-            f"Mean of the same frames after {overview.klip.label}, on the same scale. "
-            f"{_kept('Any source, a candidate too, keeps about', theirs, separations)}"
-        ).rstrip()
+    if overview.klip is not None:
+        words["klip"] = f"Mean of the same frames after {overview.klip.label}, on the same scale."
     figures, axes = _panels(len(overview.panels))
     for ax, panel in zip(axes, overview.panels, strict=True):
         overview.draw(ax, panel)
     return _pictures(figures, {each: words[each] for each in overview.panels})
-
-
-def _kept(
-    subject: str, fractions: NDArray[np.float64], separations: Sequence[float], source: str = ""
-) -> str:
-    """A sentence about the light that is kept; empty where none is known."""
-    parts = [
-        f"{100 * fraction:.0f} % of its light at {separation:.3g} arcsec"
-        for fraction, separation in zip(fractions, separations, strict=True)
-        if np.isfinite(fraction)
-    ]
-    first, others = parts[:1], [each.replace(" of its light", "") for each in parts[1:]]
-    return f"{subject} {', '.join([*first, *others])}{source}. " if parts else ""
 
 
 def _curve(
@@ -393,7 +351,7 @@ def _curve(
     caption = (
         f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}, against "
         "separation: the median of all position angles and their range. "
-        f"Dashed: the limit for an exactly known star.{beside}{dotted} {_scaled(detection)}"
+        f"Dashed: the limit for an exactly known star.{beside}{dotted}"
     )
     return [Picture("contrast_curve", figure, caption)]
 
@@ -461,23 +419,6 @@ def _stamps(detection: Detection, place: int) -> dict[int, drawing.Stamp]:
         )  # fmt: skip
         stamps[shown] = drawing.Stamp(x, y, data, left, model, noise, observation.north)
     return stamps
-
-
-def _scaled(detection: Detection) -> str:
-    """How errors were scaled, in a sentence."""
-    factors = detection.error_factor.factors
-    if not detection.error_factor.is_needed:
-        return "Errors are as in the fit, not scaled."
-    if not detection.error_factor.is_measured:
-        return (
-            f"Errors were multiplied by {factors[0, 0]:.2f}, the square root of the reduced "
-            "chi-squared without the candidates."
-        )
-    return (
-        f"Errors were multiplied by {factors.min():.2f} to {factors.max():.2f}, depending on "
-        "the star's light and the separation, so that the S/N away from candidates has a "
-        "standard deviation of 1."
-    )
 
 
 def _wide(wide: WideField) -> list[Picture]:
