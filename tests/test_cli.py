@@ -12,7 +12,7 @@ from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +25,6 @@ from pyklip_diffrender import errors
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.cli.session import claim_file, claim_folder
 from pyklip_diffrender.reduction import Preparation, ProductFolder, ReduceOptions
-from pyklip_diffrender.surveys import execution
 from pyklip_diffrender.wavefront.opd import random_opd
 
 # The package has the command under the name of its module.
@@ -155,18 +154,6 @@ def test_a_link_to_a_folder_is_taken(tmp_path):
     (tmp_path / "out").symlink_to(tmp_path / "real")
     claim_folder(tmp_path / "out", ("report.html",))
     claim_file(tmp_path / "out" / "star.fits")
-
-
-@pytest.mark.parametrize("file", ["survey.py", "<stdin>", None])
-def test_a_script_from_standard_input_is_not_told_to_add_a_guard(monkeypatch, file):
-    words = "came from standard input"
-    if file == "survey.py":
-        words = "needs `if __name__ == '__main__':`"
-    script = ModuleType("__main__")
-    script.__file__ = file
-    monkeypatch.setitem(sys.modules, "__main__", script)
-    monkeypatch.delattr(sys, "ps1", raising=False)
-    assert words in execution._why_not_spawned()
 
 
 def write_frame(folder, name, **cards):

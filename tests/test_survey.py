@@ -409,24 +409,20 @@ def test_a_worker_that_sees_something_else_says_so(tmp_path, what):
     assert jobs.exists() == (what != "output")
 
 
-def test_the_tables_say_the_same(tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
+def test_the_table_that_is_written_is_that_which_is_returned(tmp_path):
     config = inputs(tmp_path / "data", 2)
     config["sequence"][0]["injections"] = PLANET
     table = run_survey(config, tmp_path / "out", stub)
     ecsv = Table.read(tmp_path / "out" / "results.ecsv")
-    rows = parquet.read_table(tmp_path / "out" / "results.parquet").to_pylist()
-    assert len(rows) == len(ecsv) == len(table) == 3
-    for mine, row, theirs in zip(table, rows, ecsv, strict=True):
+    assert len(ecsv) == len(table) == 3
+    for mine, theirs in zip(table, ecsv, strict=True):
         for name in table.colnames:
-            value = None if np.ma.is_masked(mine[name]) else mine[name]
-            assert row[name] == value
-            assert np.ma.is_masked(theirs[name]) if value is None else theirs[name] == value
-    assert rows[0]["snr"] == 30.0
-    assert rows[0]["candidates"] == 1
-    assert rows[0]["limit_1.0_arcsec"] == 1e-5
-    assert rows[0]["limit_2.0_arcsec"] is None
-    assert rows[0]["peak_memory_bytes"] > 1e6
+            is_masked = np.ma.is_masked(mine[name])
+            assert np.ma.is_masked(theirs[name]) if is_masked else theirs[name] == mine[name]
+    assert table["snr"][0] == 30.0
+    assert table["candidates"][0] == 1
+    assert table["limit_1.0_arcsec"][0] == 1e-5
+    assert np.ma.is_masked(table["limit_2.0_arcsec"][0])
 
 
 def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path, monkeypatch):
@@ -474,12 +470,8 @@ def searching(job, folder):
     return result()
 
 
-def test_filters_of_a_star_are_searched_together_at_the_end(tmp_path, command, capsys):
+def test_filters_of_a_star_are_searched_together_at_the_end(tmp_path, command):
     assert command(searching, 4) == 0
-    said = capsys.readouterr().out
-    assert said.count("all filters and epochs") == 1
-    # 4.1 sqrt(2) and the noise of these seeds; each filter alone needs 5.
-    assert "HD 1, all filters and epochs: S/N 5.4 at 0.698 arcsec" in said
     (folder,) = (tmp_path / "out" / "combined").iterdir()
     assert folder.name.startswith("HD-1_")
     assert sorted(each.name for each in folder.iterdir()) == [
@@ -487,6 +479,8 @@ def test_filters_of_a_star_are_searched_together_at_the_end(tmp_path, command, c
         "comparison.json",
     ]  # fmt: skip
     (row,) = QTable.read(folder / "combined_candidates.ecsv")
+    # 4.1 sqrt(2) and the noise of these seeds; each filter alone needs 5.
+    assert f"{row['snr']:.1f} {row['separation'].value:.3f}" == "5.4 0.698"
     assert np.hypot(row["delta_ra"].value - PLACE[0], row["delta_dec"].value - PLACE[1]) < 0.06
     text = (tmp_path / "out" / "survey.html").read_text(encoding="utf-8")
     section = text.partition("Filters and epochs together")[2].partition("</section>")[0]
@@ -529,7 +523,7 @@ def test_a_combined_search_is_kept_until_its_jobs_or_spectra_change(tmp_path, ca
     assert not [each for each in (output / "combined").iterdir() if each.name.startswith(".")]
 
 
-def test_what_cannot_be_searched_together_is_said(tmp_path, command, capsys, monkeypatch):
+def test_what_cannot_be_searched_together_is_said(tmp_path, command, monkeypatch):
     """Two jobs of one frame with other options are one observation; epochs need a motion."""
     later = partial(searched, "F444W", 5, mjd=60400.0, header=STAR)
     monkeypatch.setitem(SEARCHED, "wide", SEARCHED["star0_calints"])
@@ -540,24 +534,18 @@ def test_what_cannot_be_searched_together_is_said(tmp_path, command, capsys, mon
     monkeypatch.setitem(SEARCHED, "star1_calints", later)
     assert command(searching, 2) == 0
     words = "no combined search: combine: got reductions of several epochs"
-    assert f"HD 1: {words}" in capsys.readouterr().out
     assert words in (tmp_path / "out" / "survey.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("missing", ["dask", "pyarrow"])
-def test_without_the_extra(tmp_path, monkeypatch, missing):
+def test_without_the_extra(tmp_path, monkeypatch):
     config = inputs(tmp_path / "data", 1)
-    for name in [each for each in sys.modules if each.split(".")[0] == missing]:
+    for name in [each for each in sys.modules if each.split(".")[0] == "dask"]:
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setitem(sys.modules, f"{missing}.distributed", None)
-    found = "pyklip_diffrender.surveys.survey_page.find_spec"
-    monkeypatch.setattr(found, lambda name: None if name == missing else 1)
-    if missing == "dask":
-        with pytest.raises(IncompatibleSetupError, match=r"pip install .dask\[.*workers = 0"):
-            run_survey({**config, "workers": 1}, tmp_path / "out", stub)
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    with pytest.raises(IncompatibleSetupError, match=r"pip install .dask\[.*workers = 0"):
+        run_survey({**config, "workers": 1}, tmp_path / "out", stub)
     assert list(run_survey(config, tmp_path / "out", stub)["status"]) == ["finished"]
     assert (tmp_path / "out" / "results.ecsv").exists()
-    assert (tmp_path / "out" / "results.parquet").exists() == (missing != "pyarrow")
 
 
 @pytest.mark.parametrize("broken", [False, True])
@@ -567,11 +555,8 @@ def test_the_command_says_what_came_of_it(tmp_path, command, capsys, broken):
     assert command(work, 2, planet) == int(broken)
     said = capsys.readouterr().out
     assert f"{3 - 2 * broken} of 3 jobs finished, {2 * broken} failed" in said
-    # The injected planet, which the stub finds beside star 1, is no candidate.
-    assert said.count("S/N") == 2 - broken
-    assert "star0_calints: S/N 30.0 at 0.820 arcsec" in said
     assert ("star1_calints failed: ValueError: no such star" in said) == broken
-    assert f"wrote {tmp_path / 'out' / 'survey.html'}" in said
+    assert f" and {tmp_path / 'out' / 'survey.html'}" in said
 
 
 def test_an_interrupted_command_says_that_it_can_go_on(tmp_path, command, capsys):

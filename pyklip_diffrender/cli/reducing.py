@@ -288,26 +288,7 @@ def run(config: Path, output: Path, scheduler: str | None = None, *, progress: b
     failed = table[table["status"] == "failed"]
     counts = {status: int((table["status"] == status).sum()) for status in ("finished", "failed")}
     click.echo(f"{counts['finished']} of {len(table)} jobs finished, {counts['failed']} failed")
-    # The candidates of a job with an injected planet include that planet.
-    real = (table["status"] == "finished") & table["injected_contrast"].mask
-    for row in table[real & ~table["snr"].mask]:
-        click.echo(
-            f"  {row['name']}: S/N {row['snr']:.1f} at {row['separation_arcsec']:.3f} arcsec, "
-            f"contrast {row['contrast']:.2e} +- {row['contrast_error']:.1e}"
-        )
-    for star in table.meta["combined"]:
-        if "reason" in star:
-            click.echo(f"  {star['star']}: no combined search: {star['reason']}")
-            continue
-        for each in star["candidates"]:
-            verdict = f", {each['verdict']}" if "verdict" in each else ""
-            click.echo(
-                f"  {star['star']}, all filters and epochs: S/N {each['snr']:.1f} at "
-                f"{each['separation_arcsec']:.3f} arcsec ({each['spectrum']}){verdict}"
-            )
     for row in failed:
         click.echo(f"  {row['name']} failed: {row['message']}")
-    for name in ("results.ecsv", "results.parquet", "survey.html"):
-        if (output / name).exists():
-            click.echo(f"wrote {output / name}")
+    click.echo(f"wrote {output / 'results.ecsv'} and {output / 'survey.html'}")
     return 1 if len(failed) else 0

@@ -28,7 +28,7 @@ from pyklip_diffrender.surveys.jobs import (
     staged,
 )
 from pyklip_diffrender.surveys.stars import StarSearch, search_stars
-from pyklip_diffrender.surveys.survey_page import row, table_of, write_tables
+from pyklip_diffrender.surveys.survey_page import row, table_of
 
 _log = logging.getLogger(__name__)
 
@@ -59,8 +59,8 @@ def survey(
         TOML file, or its content; see :doc:`the guide </howto/survey>`.
     output : path
         Folder for ``jobs/NAME_KEY/`` with the products of each job, ``combined/STAR_KEY/`` with
-        the search over all filters and epochs of each star that has several, ``results.ecsv``,
-        ``results.parquet`` and ``survey.html``. Several surveys may use the same folder.
+        the search over all filters and epochs of each star that has several, ``results.ecsv``
+        and ``survey.html``. Several surveys may use the same folder.
     scheduler : str, optional
         Address of a dask scheduler, such as ``tcp://host:8786``. Default processes on this
         machine, as many as the configuration says.
@@ -233,7 +233,7 @@ class _Board:
         # Written beside the old ones and then moved: whoever reads them meanwhile gets whole files.
         try:
             with staged(self.output / "jobs", "tables") as folder:
-                write_tables(self.rows, folder)
+                table_of(self.rows).write(folder / "results.ecsv", format="ascii.ecsv")
                 (folder / "survey.html").write_text(text, encoding="utf-8")
                 for path in folder.iterdir():
                     os.replace(path, self.output / path.name)

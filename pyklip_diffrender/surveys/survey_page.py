@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,7 +52,6 @@ COLUMNS: dict[str, tuple[type, str]] = {
     "recovered_snr": (float, ""),
     "recovered": (bool, "whether a candidate is within 0.1 arcsec of the injected planet"),
     "seconds": (float, "duration of the job"),
-    "peak_memory_bytes": (int, "largest memory of the job"),
     "ended": (str, "time at which the job ended, UTC"),
     "host": (str, ""),
     "message": (str, ""),
@@ -69,7 +66,7 @@ Contrasts come first, because a table that is too wide to print loses its middle
 
 _COLUMN_FORMATS = {"contrast": ".2e", "snr": ".1f"}
 
-_COLUMN_UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s, "bytes": u.byte}
+_COLUMN_UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s}
 """Units by the last word of the name of a column; limits are contrasts at the separation there."""
 
 
@@ -117,20 +114,6 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def write_tables(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
-    """Write ``results.ecsv`` and, where pyarrow is installed, ``results.parquet``."""
-    table_of(rows).write(folder / "results.ecsv", format="ascii.ecsv")
-    if find_spec("pyarrow") is None:
-        return
-    import pyarrow as pa
-    from pyarrow import parquet as files
-
-    kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-    schema = pa.schema([(name, kinds[kind]) for name, (kind, _) in COLUMNS.items()])
-    table = pa.Table.from_pylist(list(rows), schema=schema)
-    files.write_table(table, folder / "results.parquet")
-
-
 # The results of a survey so far, as one HTML page that loads nothing from anywhere.
 
 Jobs = Sequence[tuple[Job, Record | None]]
@@ -168,10 +151,6 @@ def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
             ("Sequences", len(rows) - injected),
             ("Injected planets", injected),
             ("Time of all jobs", duration(seconds) if seconds else "none yet"),
-            (
-                "Largest memory of a job",
-                f"{max(each['peak_memory_bytes'] or 0 for each in rows) / 2**30:.2f} GiB",
-            ),
         ],
         rows=rows,
         pictures=_pictures(jobs),
