@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import nullcontext, redirect_stdout, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from json import dumps, loads
+from json import loads
 from pathlib import Path
 from typing import Any, Literal
 
@@ -90,7 +89,6 @@ def run_reduction(
     *,
     output: Path,
     overwrite: bool,
-    json: bool,
     dry_run: bool,
     derivatives: bool,
     figures: Literal["pdf", "png", "svg"] | None,
@@ -103,8 +101,6 @@ def run_reduction(
 
     A dry run makes all the checks of a run, and stops before the first fit.
     """
-    if dry_run and json:
-        raise click.UsageError("A --dry-run has no summary to print with --json.")
     try:
         checked_motion(proper_motion, parallax)
     except DiffrenderError as error:
@@ -118,37 +114,32 @@ def run_reduction(
     claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
     above = named_files(output, (*COMPARISON, *COMBINED), overwrite)
     earlier = [ProductFolder(each, overwrite=True) for each in _listed(output)]
-    # Libraries may print, too.
-    with redirect_stdout(sys.stderr) if json else nullcontext():
-        sequences = read()
-        if not sequences:
-            return
-        several = len(sequences) > 1
-        folders = [output / name for name in _names(sequences)] if several else [output]
-        written = [ProductFolder(each, **writing) for each in folders] if several else [whole]
-        _require_flux_and_spectra(sequences, start.options, spectra)
-        prepared = []
-        for sequence, folder in zip(sequences, folders, strict=True):
-            if several:
-                claim_folder(folder, tuple(PRODUCTS))
-                click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
-            prepared.append(start.prepared(sequence))
-        if dry_run:
-            return
-        summaries = {
-            products.folder: _reduced(preparation, products, progress=run.progress)
-            for preparation, products in zip(prepared, written, strict=True)
-        }
-        place = above.place() if several else output
-        above.clear()
-        _clear([whole, *earlier], folders)
-        (summary, *_) = summaries.values()
+    sequences = read()
+    if not sequences:
+        return
+    several = len(sequences) > 1
+    folders = [output / name for name in _names(sequences)] if several else [output]
+    written = [ProductFolder(each, **writing) for each in folders] if several else [whole]
+    _require_flux_and_spectra(sequences, start.options, spectra)
+    prepared = []
+    for sequence, folder in zip(sequences, folders, strict=True):
         if several:
-            search = {"spectra": spectra or SPECTRA, "star": start.star_sed}
-            motion = {"motion": proper_motion, "parallax": parallax}
-            summary = _compared(summaries, place, **search, **motion)
-    if json:
-        click.echo(dumps(summary, indent=2))
+            claim_folder(folder, tuple(PRODUCTS))
+            click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
+        prepared.append(start.prepared(sequence))
+    if dry_run:
+        return
+    summaries = {
+        products.folder: _reduced(preparation, products, progress=run.progress)
+        for preparation, products in zip(prepared, written, strict=True)
+    }
+    place = above.place() if several else output
+    above.clear()
+    _clear([whole, *earlier], folders)
+    if several:
+        search = {"spectra": spectra or SPECTRA, "star": start.star_sed}
+        motion = {"motion": proper_motion, "parallax": parallax}
+        _compared(summaries, place, **search, **motion)
     require_in_place(*written, above)
 
 
@@ -175,21 +166,20 @@ def _reduced(preparation: Preparation, products: ProductFolder, *, progress: boo
     return summary
 
 
-def _compared(summaries: Mapping[Path, Any], place: Path, **search: Any) -> Any:
+def _compared(summaries: Mapping[Path, Any], place: Path, **search: Any) -> None:
     """Search finished reductions together, and compare them on a page in the folder `place`.
 
     `summaries` are by the folders of the reductions, and `search` the arguments of
-    `search_together`. Returns the content of ``comparison.json``.
+    `search_together`.
     """
     combination = search_together(list(summaries), **search)
     named = {
         Path(os.path.relpath(folder, place)).as_posix(): each for folder, each in summaries.items()
     }
-    page, data = write_comparison(named, place, combination)
+    page, _ = write_comparison(named, place, combination)
     if isinstance(combination, Combination):
         combination.write(place)
     click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
-    return loads(read_text(data))
 
 
 def _require_flux_and_spectra(

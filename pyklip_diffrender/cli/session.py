@@ -421,8 +421,6 @@ search = _all(
     option("--figures", type=click.Choice(("pdf", "png", "svg")), section="Output",
            help="Write every figure of the report to a file of this format, too, in the folder "
            "figures."),
-    option("--json", is_flag=True, section="Output",
-           help="Print the content of summary.json and nothing else on standard output."),
 )  # fmt: skip
 
 together = _all(
