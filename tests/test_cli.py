@@ -61,7 +61,7 @@ def test_help_of_a_command_has_sections_and_examples(capsys, command):
         (["learn", "x", "-o", "y"], "flat to start without one"),
         (["reduce", "x", "-o", "y", "--opd", "z", "--opd-date", "closest"], "nearest"),
         (["reduce", "x", "-o", "y", "--opd", "z", "--threshold", "-3"], "threshold: got -3"),
-        (["reduce", "x", "-o", "y", "--opd", "z", "--star", "12"], "'12', expected x,y"),
+        (["reduce", "x", "-o", "y", "--opd", "z", "--star", "12"], "'--star' requires 2 arguments"),
         (["reduce", "x", "-o", "y", "--opd", "z", "--disk", "--wide"], "wide, disk: got both"),
         (["reduce", "x", "-o", "y", "--opd", "z", "--pattern", "no.fits"], "pattern: got"),
         (["reduce", "x", "-o", "y", "--opd", "z", "--opd-folder", "x"], "--opd-folder"),
@@ -433,20 +433,15 @@ def test_a_spectrum_says_how_bright_the_star_is(tmp_path, reducing, capsys):
     assert "both say how bright the star is" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("before", [True, False])
-def test_general_options_stand_before_or_after_the_command(
-    tmp_path, detecting, reduced, capsys, monkeypatch, before
-):
+def test_general_options_go_with_every_command(detecting, reduced, capsys, monkeypatch):
     threads = []
     monkeypatch.setattr(torch, "set_num_threads", threads.append)
-    log = tmp_path / "logs" / "run.log"
-    general = ["-q", "--threads", "1", "--log-file", str(log)]
-    assert main([*general, *detecting] if before else [*detecting, *general]) == 0
+    handlers = list(logging.root.handlers)
+    assert main([*detecting, "-q", "--threads", "1"]) == 0
     assert threads == [1]
     assert capsys.readouterr().err == ""
-    assert re.search(r"opd_2022-07-31\.fits(.|\n)*INFO 1\. products", log.read_text())
     # What the run changed is as it was.
-    assert not any(getattr(h, "baseFilename", "") == str(log) for h in logging.root.handlers)
+    assert logging.root.handlers == handlers
 
 
 @pytest.mark.parametrize(("map_", "said"), [("opd_2022-07-25.fits", 0), ("opd_2022-07-01.fits", 1)])
@@ -517,15 +512,6 @@ def test_a_disk_without_room_is_found_before_the_work(reducing, reduced, capsys,
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=1e12, free=2e7))
     assert main(reducing) == 1
     assert "got 20 MB of room on the disk, expected at least 100 MB" in capsys.readouterr().err
-    assert reduced == []
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux has a folder that takes no files.")
-def test_a_folder_that_takes_no_files(reducing, reduced, capsys):
-    assert main([*reducing, "-o", "/proc/x"]) == 1
-    shown = capsys.readouterr().err
-    assert "/proc/x cannot be written" in shown
-    assert "room" not in shown
     assert reduced == []
 
 

@@ -119,22 +119,6 @@ def demo(
     require_in_place(products)
 
 
-def _star_callback(
-    ctx: click.Context, parameter: click.Parameter, text: str | None
-) -> tuple[float, float] | None:
-    """The position of a star from "x,y"."""
-    if text is None:
-        return None
-    try:
-        x, y = (float(part) for part in str(text).strip("()[] ").split(","))
-    except ValueError:
-        raise click.BadParameter(
-            f"got {text!r}, expected x,y of the star in pixels from 0, such as 150,174.2",
-            ctx, parameter,
-        ) from None  # fmt: skip
-    return x, y
-
-
 @click.command(
     "reduce",
     cls=Command,
@@ -156,7 +140,7 @@ Examples:
     help="Which filter; default: all of the target's, one by one.",
 )
 @option(
-    "--star", metavar="X,Y", section="Frames", callback=_star_callback,
+    "--star", type=float, nargs=2, metavar="X Y", section="Frames",
     help="Where the target's star is in its files, pixels from 0, in place of what the headers say "
          "and whatever else the frames show.",
 )  # fmt: skip
@@ -406,12 +390,10 @@ _log = logging.getLogger(__name__)
     subcommand_metavar="COMMAND ...",
 )
 @click.version_option(__version__, prog_name=PROGRAM, message="%(prog)s %(version)s")
-@common
-def application(**_: Any) -> None:
+def application() -> None:
     """Find planets in JWST coronagraphic images by refining the wavefront.
 
-    `pyklip-diffrender COMMAND --help` explains a command. The general options may stand before
-    the command or after it.
+    `pyklip-diffrender COMMAND --help` explains a command.
     """
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from pyklip_diffrender.errors import ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
@@ -126,9 +125,7 @@ class Run:
                 logging.getLogger().removeHandler(handler)
                 handler.close()
 
-    def configure(
-        self, *, verbose: bool, quiet: bool, log_file: Path | None, device: str, threads: int | None
-    ) -> None:
+    def configure(self, *, verbose: bool, quiet: bool, device: str, threads: int | None) -> None:
         """Take what the options of all commands say."""
         on_terminal = _OnTerminal()
         # Away from a terminal a bar is noise: the stages and a line a minute take its place.
@@ -141,16 +138,9 @@ class Run:
                 record.levelno >= threshold or (stages and record.name.endswith(".progress"))
             )
         )
-        self._add(on_terminal)
+        logging.getLogger().addHandler(on_terminal)
+        self._handlers.append(on_terminal)
         logging.getLogger("pyklip_diffrender").setLevel(logging.DEBUG if verbose else logging.INFO)
-        if log_file is not None:
-            try:
-                log_file.parent.mkdir(parents=True, exist_ok=True)
-                to_file = logging.FileHandler(log_file, encoding="utf-8")
-            except OSError as error:
-                raise IncompatibleSetupError(f"--log-file: {error}") from error
-            to_file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-            self._add(to_file)
         self.device = device
         if device != "cpu":
             _require_device(device)
@@ -158,10 +148,6 @@ class Run:
             import torch
 
             torch.set_num_threads(threads)
-
-    def _add(self, handler: logging.Handler) -> None:
-        logging.getLogger().addHandler(handler)
-        self._handlers.append(handler)
 
 
 def claim_folder(folder: Path, products: tuple[str, ...]) -> None:
@@ -187,11 +173,6 @@ def _require_room(output: Path, folder: Path) -> None:
     if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
         raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
     disk = shutil.disk_usage(folder)
-    if not disk.total:
-        raise IncompatibleSetupError(
-            f"{output} cannot be written: {folder} is of the system, and takes no files. "
-            "Choose another place"
-        )
     if disk.free < _LEAST_ROOM_BYTES:
         raise IncompatibleSetupError(
             f"{output}: got {disk.free / 1e6:.0f} MB of room on the disk, expected at least "
@@ -315,7 +296,7 @@ class _Wavefront(click.types.StringParamType):
 
 
 class Command(click.Command):
-    """A command with help by section, whose general options may also stand before it."""
+    """A command with the general options, and with help by section."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of the options."""
@@ -333,24 +314,17 @@ class Command(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Apply the general options, then run the command with its own."""
-        if ctx.parent is not None:
-            for name in COMMON:
-                before, own = (c.get_parameter_source(name) for c in (ctx.parent, ctx))
-                if before is ParameterSource.COMMANDLINE and own is not before:
-                    ctx.params[name] = ctx.parent.params[name]
         general = {name: ctx.params.pop(name) for name in COMMON}
         ctx.ensure_object(Run).configure(**general)
         return super().invoke(ctx)
 
 
-COMMON = ("verbose", "quiet", "log_file", "device", "threads")
-"""Options that may stand before the command and after it."""
+COMMON = ("verbose", "quiet", "device", "threads")
+"""Options of all commands."""
 
 common = _all(
     option("-v", "--verbose", is_flag=True, section=_GENERAL, help="Log every step of a fit."),
     option("-q", "--quiet", is_flag=True, section=_GENERAL, help="Show no progress."),
-    option("--log-file", type=file_type(), metavar="FILE", section=_GENERAL,
-           help="Append the messages to this file, with their times."),
     declared("device"),
     option("--threads", type=click.IntRange(min=1), metavar="N", section=_GENERAL,
            help="Number of threads; default: PyTorch's choice."),
