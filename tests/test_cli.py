@@ -515,6 +515,15 @@ def test_a_disk_without_room_is_found_before_the_work(reducing, reduced, capsys,
     assert reduced == []
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux has a folder that takes no files.")
+def test_a_folder_that_takes_no_files(reducing, reduced, capsys):
+    assert main([*reducing, "-o", "/proc/x"]) == 1
+    shown = capsys.readouterr().err
+    assert "/proc/x cannot be written" in shown
+    assert "room" not in shown
+    assert reduced == []
+
+
 def test_doctor_reports_versions_data_and_machine(monkeypatch, capsys):
     assert main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -611,6 +611,32 @@ def test_a_report_that_fails_leaves_the_old_one(tmp_path):
     assert (tmp_path / "report.html").read_text() == "old"
 
 
+@pytest.mark.parametrize(
+    ("klip", "said"),
+    [
+        (
+            [4e-5, 4e-6, 1e-5],
+            "Without a small-sample correction of either, this reduction is 4.0 times deeper at "
+            "0.40 arcsec and KLIP is 1.2 times deeper at 0.80 arcsec; with it, this reduction is "
+            "2.0 to 10.0 times deeper at 0.40 to 0.80 arcsec.",
+        ),
+        ([None, None, None], "no limits can be compared; with it, this reduction is 2.0 to 10.0"),
+    ],
+    ids=["both", "KLIP has none"],
+)
+def test_the_report_says_who_is_deeper_where(klip, said):
+    curve = {
+        "separation_arcsec": [0.4, 0.8], "contrast": [1e-5, 4.8e-6], "small_sample": [2e-5, 5e-6]
+    }  # fmt: skip
+    # The last of KLIP's separations is beyond the curve.
+    other = {
+        "separation_arcsec": [0.4, 0.8, 1.2], "contrast": klip, "small_sample": [2e-4, 1e-5, 1e-5]
+    }  # fmt: skip
+    assert said in pages.depth_against_klip(curve, other)
+    assert pages.depth_against_klip(curve, None) == ""
+    assert pages.depth_against_klip(curve | {"separation_arcsec": [0.1, 0.2]}, other) == ""
+
+
 @pytest.mark.slow
 def test_every_figure_is_a_file_of_its_own(tmp_path):
     whole = reduction()

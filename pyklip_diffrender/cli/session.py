@@ -173,6 +173,11 @@ def _require_room(output: Path, folder: Path) -> None:
     if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
         raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
     disk = shutil.disk_usage(folder)
+    if not disk.total:
+        raise IncompatibleSetupError(
+            f"{output} cannot be written: {folder} is of the system, and takes no files. "
+            "Choose another place"
+        )
     if disk.free < _LEAST_ROOM_BYTES:
         raise IncompatibleSetupError(
             f"{output}: got {disk.free / 1e6:.0f} MB of room on the disk, expected at least "

@@ -8,9 +8,12 @@ from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
+
+import numpy as np
 
 from pyklip_diffrender import drawing
 
@@ -162,6 +165,55 @@ def _places(error: float) -> int:
         return 3
     power = math.floor(math.log10(error))
     return max(0, -power + (error / 10**power < 2))
+
+
+def depth_against_klip(curve: Mapping[str, Any], klip: Mapping[str, Any] | None) -> str:
+    """Say in a sentence whose limits are deeper at which separations, and by how much.
+
+    The curves are from a summary (separation_arcsec, contrast, small_sample), and are compared
+    at KLIP's separations. Empty without KLIP, or if the curves have no separation in common.
+    """
+    if klip is None:
+        return ""
+    raw, corrected = (_deeper(curve, klip, name) for name in ("contrast", "small_sample"))
+    if not raw and not corrected:
+        return ""
+    return (
+        f"Without a small-sample correction of either, {raw or 'no limits can be compared'}; with "
+        f"it, {corrected or 'no limits can be compared'}."
+    )
+
+
+def _deeper(curve: Mapping[str, Any], klip: Mapping[str, Any], name: str) -> str:
+    """Where this package and where KLIP has the deeper limits of one kind."""
+    places, ours, at, theirs = (
+        np.array(values, dtype=float)
+        for values in (
+            curve["separation_arcsec"], curve[name], klip["separation_arcsec"], klip[name],
+        )
+    )  # fmt: skip
+    if not len(places):
+        return ""
+    # Limits fall by orders of magnitude with the separation: their logarithms are interpolated.
+    ratios = theirs / np.exp(np.interp(at, places, np.log(ours), np.nan, np.nan))
+    known = [(s, r) for s, r in zip(at, ratios, strict=True) if math.isfinite(r)]
+    parts = []
+    for is_ours, run in groupby(known, lambda each: each[1] >= 1):
+        separations, factors = np.array(list(run)).T
+        if not is_ours:
+            factors = 1 / factors
+        span = _span(separations, ".2f")
+        parts.append(
+            f"{'this reduction' if is_ours else 'KLIP'} is {_span(factors, '.1f')} times deeper at "
+            f"{span} arcsec"
+        )
+    return " and ".join(parts)
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    """The range of values, or one number if its ends are written alike."""
+    ends = [f"{each:{form}}" for each in (min(values), max(values))]
+    return " to ".join(dict.fromkeys(ends))
 
 
 # Pages of HTML that need no other file: their templates, pictures and numbers.

@@ -16,6 +16,7 @@ from pyklip_diffrender.io.files import OutputFolder, read_text, replacing, write
 from pyklip_diffrender.reduction.pages import (
     FIGURE_FORMATS,
     count,
+    depth_against_klip,
     number,
     plus_minus,
     remark_on_map,
@@ -58,6 +59,7 @@ def page(
         sky_columns=[each for each in _SKY_COLUMNS if first and each.key in first[0]],
         photometry=_PHOTOMETRY,
         outside=0 if wide is None else len(wide["candidates"]) - len(summary["candidates"]),
+        deeper=depth_against_klip(summary["contrast_curve"], summary["klip_curve"]),
         age=_age(summary["opd"]["days_before_first_frame"]),
         map_remark=remark_on_map(summary["opd"]["days_before_first_frame"]),
         left_out=by_reason((each["name"], each["reason"]) for each in summary["left_out"]),
