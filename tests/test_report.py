@@ -25,7 +25,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.reduction import existing_products, pages, summarise, write_report
+from pyklip_diffrender.reduction import pages, summarise, write_report
 from pyklip_diffrender.reduction.extended_light import looks_extended
 from pyklip_diffrender.reduction.fit_status import advice
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
@@ -635,24 +635,6 @@ def test_the_report_says_who_is_deeper_where(klip, said):
     assert said in pages.depth_against_klip(curve, other)
     assert pages.depth_against_klip(curve, None) == ""
     assert pages.depth_against_klip(curve | {"separation_arcsec": [0.1, 0.2]}, other) == ""
-
-
-@pytest.mark.slow
-def test_every_figure_is_a_file_of_its_own(tmp_path):
-    whole = reduction()
-    written = whole.write(tmp_path, figures="pdf")
-    drawn = sorted(path for path in written if path.parent.name == "figures")
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert len(drawn) == text.count("<figure>") == 11
-    assert all(path.read_bytes().startswith(b"%PDF") for path in drawn)
-    assert 'href="figures/"' in text
-    mine = tmp_path / "figures" / "mine.pdf"
-    mine.write_bytes(b"mine")
-    assert set(existing_products(tmp_path)) == set(written)
-    whole.write(tmp_path, overwrite=True)
-    assert list((tmp_path / "figures").iterdir()) == [mine]
-    with pytest.raises(IncompatibleSetupError, match="figures: got 'eps', expected one of pdf"):
-        whole.write(tmp_path, overwrite=True, figures=cast(Any, "eps"))
 
 
 def shown():

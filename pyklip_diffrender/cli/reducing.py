@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from json import loads
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 
@@ -91,7 +91,6 @@ def run_reduction(
     overwrite: bool,
     dry_run: bool,
     derivatives: bool,
-    figures: Literal["pdf", "png", "svg"] | None,
     spectra: tuple[str, ...],
     proper_motion: tuple[str, str] | None,
     parallax: str | None,
@@ -107,9 +106,7 @@ def run_reduction(
         raise click.UsageError(str(error)) from error
     start = _Start.checked(device=run.device, **options)
     # What is there now may be replaced if the user says so, but not what other runs write later.
-    writing: dict[str, Any] = {
-        "derivatives": derivatives, "figures": figures, "overwrite": overwrite,
-    }  # fmt: skip
+    writing = {"derivatives": derivatives, "overwrite": overwrite}
     whole = ProductFolder(output, **writing)
     claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
     above = named_files(output, (*COMPARISON, *COMBINED), overwrite)

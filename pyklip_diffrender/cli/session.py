@@ -397,9 +397,6 @@ search = _all(
     option("--derivatives", is_flag=True, section="Output",
            help="Keep the fit's derivatives in fit.fits, which then takes ten times the space: "
            "they are needed to search the fit again."),
-    option("--figures", type=click.Choice(("pdf", "png", "svg")), section="Output",
-           help="Write every figure of the report to a file of this format, too, in the folder "
-           "figures."),
 )  # fmt: skip
 
 together = _all(

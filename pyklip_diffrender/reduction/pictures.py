@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -294,11 +294,6 @@ class ReportPictures:
             _wavefront(reduction, summary),
         )
 
-    def __iter__(self) -> Iterator[Picture]:
-        for each in (self.overview, self.curve, *self.candidates, self.wide, self.disk,
-                     self.injections, self.completeness, *self.stars, self.wavefront):  # fmt: skip
-            yield from each
-
 
 def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     """The frames without the star, KLIP's beside them, and the S/N map; north is up."""
@@ -325,7 +320,7 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     figures, axes = _panels(len(overview.panels))
     for ax, panel in zip(axes, overview.panels, strict=True):
         overview.draw(ax, panel)
-    return _pictures(figures, {each: words[each] for each in overview.panels})
+    return _pictures(figures, [words[each] for each in overview.panels])
 
 
 def _curve(
@@ -353,7 +348,7 @@ def _curve(
         "separation: the median of all position angles and their range. "
         f"Dashed: the limit for an exactly known star.{beside}{dotted}"
     )
-    return [Picture("contrast_curve", figure, caption)]
+    return [Picture(figure, caption)]
 
 
 def _candidate(detection: Detection, place: int) -> list[Picture]:
@@ -362,7 +357,6 @@ def _candidate(detection: Detection, place: int) -> list[Picture]:
     unit = drawing.unit_label(detection.observation.unit)
     return [
         Picture(
-            f"candidate_{number}_frame_{frame}",
             drawing.stamp_panels(stamp, unit),
             f"Candidate {number} in frame {frame}{_roll(stamp.north)}: the data; without star, "
             "background and other candidates; the model of the source, on the same scale; and what "
@@ -430,18 +424,16 @@ def _wide(wide: WideField) -> list[Picture]:
     oriented = wide.observation.position_angles is not None
     up = "north up" if oriented else "oriented like the first frame"
     ny, nx = wide.snr.shape
-    words = {
-        "whole_frames_snr": (
+    words = [
+        (
             f"S/N of a point source in the whole frames, {some}, {up}: {nx} × {ny} pixels, at most "
             "the field of the mask, 20 arcsec wide. Circles have the numbers of the table. About "
             "the star it is the S/N of the search above; elsewhere the star, extrapolated from its "
             "fit, and the background were subtracted. Errors follow the scatter of the S/N at "
             "every separation."
         ),
-        "whole_frames_contrast_curve": (
-            "Contrast limit to the edge of the frames, as far as half of a ring is in them."
-        ),
-    }
+        ("Contrast limit to the edge of the frames, as far as half of a ring is in them."),
+    ]
     return _pictures(figures, words)
 
 
@@ -449,17 +441,17 @@ def _disk(disk: Disk) -> list[Picture]:
     """The frames without the star, and the extended light that was fitted."""
     figures, axes = _panels(2)
     disk.plot(axes)
-    words = {
-        "extended_light": (
+    words = [
+        (
             "Frames minus the star, turned to the orientation of the first one and averaged. The "
             "star was fitted together with the extended light, which therefore is not subtracted "
             "with it."
         ),
-        "extended_light_model": (
+        (
             "Light of the non-negative sources that were fitted together with the star, as the "
             "coronagraph shows it in the first frame."
         ),
-    }
+    ]
     return _pictures(figures, words)
 
 
@@ -471,7 +463,7 @@ def _injections(planets: QTable) -> list[Picture]:
         f"Recovered over injected contrast of {len(planets)} planets against separation. Filled: "
         "detected. Open: not detected, and measured at the known place."
     )
-    return [Picture("injected_planets", figure, caption)]
+    return [Picture(figure, caption)]
 
 
 def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
@@ -483,7 +475,7 @@ def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
         "Fraction of planets that the search finds, by contrast and separation. Dashed: 50 %; "
         "solid: 95 %; dotted: the contrast curve at 5 sigma."
     )
-    return [Picture("completeness", figure, caption)]
+    return [Picture(figure, caption)]
 
 
 def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
@@ -498,19 +490,18 @@ def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
     )
     mean = f", the mean of {count} integrations" if count > 1 else ""
     mean += "" if reduction.disk is None else ", without the extended light"
-    words = {
-        "data": (
+    words = [
+        (
             f"Image of {observation.target} behind the coronagraph{mean}, in {unit}. The scale is "
             "linear near 0 and logarithmic in bright parts; the cross marks the star."
         ),
-        "model": "The fitted star and background, on the same scale.",
-        "residual": (
+        "The fitted star and background, on the same scale.",
+        (
             "Data without the star, over the noise of each pixel. The scale is linear within ±5."
             f"{subtracted}"
         ),
-    }
-    named = {f"frame_{frame + 1}_{name}": text for name, text in words.items()}
-    return _pictures(_of_frame(detection, frame), named)
+    ]
+    return _pictures(_of_frame(detection, frame), words)
 
 
 def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[Picture]:
@@ -524,17 +515,15 @@ def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[P
     drawing.opd_map(axes[0], before, width, title="Before the fit", limit=limit)
     drawing.opd_map(axes[1], after, width, title="After the fit", limit=limit)
     drawing.opd_map(axes[2], after - before, width, title="Change")
-    words = {
-        "wavefront_before": (
-            f"The OPD map that the fit started from ({about['name']}), {rms[0]} rms."
-        ),
-        "wavefront_after": f"The wavefront of the first frame after the fit, {rms[1]} rms.",
-        "wavefront_change": (
+    words = [
+        (f"The OPD map that the fit started from ({about['name']}), {rms[0]} rms."),
+        f"The wavefront of the first frame after the fit, {rms[1]} rms.",
+        (
             f"Change of the wavefront, after minus before: {rms[2]} rms. The frames measure only "
             "what the Lyot stop lets through and what reaches the fitted pixels; the rest follows "
             "from the prior."
         ),
-    }
+    ]
     return _pictures(figures, words)
 
 
@@ -571,7 +560,6 @@ def _panels(count: int) -> tuple[list[Any], list[Any]]:
     return [figure for figure, _ in panels], [ax for _, ax in panels]
 
 
-def _pictures(figures: Sequence[Any], words: Mapping[str, str]) -> list[Picture]:
-    """Figures with the names of their files and their captions."""
-    pairs = zip(figures, words.items(), strict=True)
-    return [Picture(name, figure, caption) for figure, (name, caption) in pairs]
+def _pictures(figures: Sequence[Any], captions: Sequence[str]) -> list[Picture]:
+    """Figures with their captions."""
+    return [Picture(*each) for each in zip(figures, captions, strict=True)]

@@ -207,7 +207,6 @@ def _pictures(jobs: Jobs) -> list[Picture]:
     figure, axes = drawing.new_figure(1, 1)
     drawing.survey_limits(axes[0, 0], curves, candidates, sigmas)
     picture = Picture(
-        "contrast_curves",
         figure,
         "Contrast, relative to the star without coronagraph, that gives S/N "
         f"{sigmas:g}, against separation, for {count(len(curves), 'sequence')}: the median of all "
