@@ -426,7 +426,7 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
         assert (attributes["src"] or "").startswith("data:image/png;base64,")
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
     assert all((a.get("src") or "data:").startswith("data:") for _, a in page.tags)
-    picture = pages.Picture("", drawing.panel()[0], "")
+    picture = pages.Picture(drawing.panel()[0], "")
     assert picture.uri.startswith("data:image/png;base64,iVBOR")
     # Links are to the files beside it.
     linked = {a["href"] for _, a in page.tags if "href" in a}

@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from astropy.coordinates import SkyCoord
 from astropy.io.fits import Header
 from astropy.table import QTable
-from astropy.wcs import WCS
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender import drawing
@@ -38,7 +36,6 @@ from pyklip_diffrender.detection.field import (
     Image,
     Sky,
     is_within,
-    pixels_of,
     places_of,
 )
 from pyklip_diffrender.detection.measurement import (
@@ -51,12 +48,10 @@ from pyklip_diffrender.detection.measurement import (
 )
 from pyklip_diffrender.detection.published_limits import published_limits
 from pyklip_diffrender.detection.templates import Group
-from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.product_headers import world_coordinates
 
 # The figure of a search: its S/N map and its contrast curve.
 
@@ -322,28 +317,6 @@ class Detection:
         >>> table.write("limits.tex", format="ascii.aastex")  # doctest: +SKIP
         """
         return published_limits(self.contrast_curve, self, isochrone, parallax)
-
-    @property
-    def coordinates(self) -> SkyCoord:
-        """Right ascension and declination of the candidates, in the order of the table.
-
-        By the world coordinate system of the products, in which the star is where the header of
-        the first frame has it (CRVAL).
-
-        Raises
-        ------
-        IncompatibleSetupError
-            If the header does not say where the frame is on the sky.
-        """
-        wcs = WCS(world_coordinates(self.grid, self.observation))
-        if not wcs.has_celestial:
-            raise IncompatibleSetupError(
-                f"{self.observation.name}: the header does not say where the frame is on the sky, "
-                "expected CRVAL1, CRVAL2 and the orientation. Use the columns x and y"
-            )
-        table = self.candidates
-        places = np.stack([table["x"].value, table["y"].value], axis=1)
-        return wcs.pixel_to_world(*pixels_of(self.grid, places).T)
 
     @cached_property
     def _calibration_errors(self) -> Image:

@@ -432,7 +432,7 @@ def _wide(wide: WideField) -> list[Picture]:
             "fit, and the background were subtracted. Errors follow the scatter of the S/N at "
             "every separation."
         ),
-        ("Contrast limit to the edge of the frames, as far as half of a ring is in them."),
+        "Contrast limit to the edge of the frames, as far as half of a ring is in them.",
     ]
     return _pictures(figures, words)
 
@@ -516,7 +516,7 @@ def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[P
     drawing.opd_map(axes[1], after, width, title="After the fit", limit=limit)
     drawing.opd_map(axes[2], after - before, width, title="Change")
     words = [
-        (f"The OPD map that the fit started from ({about['name']}), {rms[0]} rms."),
+        f"The OPD map that the fit started from ({about['name']}), {rms[0]} rms.",
         f"The wavefront of the first frame after the fit, {rms[1]} rms.",
         (
             f"Change of the wavefront, after minus before: {rms[2]} rms. The frames measure only "

@@ -116,9 +116,6 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 Jobs = Sequence[tuple[Job, Record | None]]
 
-_MOST_TITLE_NAMES = 3
-"""Most sequences that the title names."""
-
 
 def page(jobs: Jobs) -> str:
     """The page of jobs with records, None for one that waits."""
@@ -129,12 +126,11 @@ def page(jobs: Jobs) -> str:
     parts += [f"{failed} failed"] if failed else []
     parts += [f"{waiting} not finished yet"] if waiting else []
     names = list(dict.fromkeys(job.name for job, _ in jobs))
-    more = f"{names[0]} and {len(names) - 1} more sequences"
     seconds = sum(each["seconds"] or 0.0 for each in rows)
     injected = sum(job.injection is not None for job, _ in jobs)
     return render(
         "survey.html",
-        name=f"Survey of {', '.join(names) if len(names) <= _MOST_TITLE_NAMES else more}",
+        name=f"Survey of {', '.join(names) if len(names) <= 3 else count(len(names), 'sequence')}",
         version=__version__,
         now=datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
         sentence=_sentence(jobs),
