@@ -201,10 +201,6 @@ class ErrorFactor:
         """Median over the field."""
         return float(np.median(self.factors))
 
-    def at_least(self, factor: float) -> ErrorFactor:
-        """The larger of both everywhere."""
-        return replace(self, factors=np.maximum(self.factors, factor))
-
 
 def _inverse(values: Image) -> Image:
     return np.divide(1.0, values, out=np.full_like(values, np.inf), where=values > 0)
@@ -382,8 +378,9 @@ class Significance:
         """Factor for the errors of a map with sources at x, y, (k, 2), arcsec."""
         if not self.measured:
             return ErrorFactor.constant(self.least)
-        factor = self._scatter.factor(snr, sources).at_least(self.least)
-        return replace(factor, factors=np.hypot(factor.factors, self.structures))
+        factor = self._scatter.factor(snr, sources)
+        factors = np.hypot(np.maximum(factor.factors, self.least), self.structures)
+        return replace(factor, factors=factors)
 
     @cached_property
     def _scatter(self) -> Scatter:

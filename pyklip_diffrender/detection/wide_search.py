@@ -107,11 +107,6 @@ class WideField:
         """The first frame, as far as it was fitted."""
         return self.detection.observation
 
-    @property
-    def north(self) -> float:
-        """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
-        return self.detection.north
-
     def subtracted(
         self, whole: Sequence[Observation], cut: Sequence[Observation]
     ) -> tuple[Observation, ...] | None:
@@ -287,9 +282,7 @@ class _Source:
         return np.asarray(squared < _COVERED_SIGMAS**2)
 
 
-def wide_field(
-    detection: Detection, observations: Sequence[Observation], *, threshold: float | None = None
-) -> WideField:
+def wide_field(detection: Detection, observations: Sequence[Observation]) -> WideField:
     """Search whole frames for point sources, at most in the field of the mask, 20 arcsec wide.
 
     Parameters
@@ -298,8 +291,6 @@ def wide_field(
         Search of one fit, whose frames are cutouts of the observations.
     observations : sequence of Observation
         The target's frames before they were cut, in the order of the fit.
-    threshold : float, optional
-        Smallest S/N of a candidate; default: the detection's.
 
     Returns
     -------
@@ -319,7 +310,7 @@ def wide_field(
     >>> fit = dr.refine(dr.model_for(frame, 80), frame.cutout(80), "opd.fits")  # doctest: +SKIP
     >>> wide = dr.detection.wide_field(dr.detect(fit), [frame])  # doctest: +SKIP
     """
-    threshold = detection.threshold if threshold is None else threshold
+    threshold = detection.threshold
     frames = _frames(detection, observations)
     grid = frames[0].grid
     window = _window(detection, frames[0])

@@ -258,7 +258,7 @@ def write_products(
     written.append(overview.images.write(folder / "images.fits"))
     written.append(folder / "detection.png")
     drawing.save(overview.figure(), written[-1])
-    return written + _write_page(reduction, overview, folder, written)
+    return written + write_report(reduction, overview, folder, written)
 
 
 class ProductFolder(OutputFolder):
@@ -286,19 +286,12 @@ class ProductFolder(OutputFolder):
 
 
 def write_report(
-    reduction: ReductionResult, folder: Path, files: Iterable[Path] = ()
+    reduction: ReductionResult, overview: Overview, folder: Path, files: Iterable[Path] = ()
 ) -> list[Path]:
     """Write ``report.html``, one page that needs no other file, and ``summary.json``.
 
     Files of these names are replaced. The page lists `files`, other products.
     """
-    overview = Overview(SkyImages(reduction), Klip.of(reduction))
-    return _write_page(reduction, overview, folder, files)
-
-
-def _write_page(
-    reduction: ReductionResult, overview: Overview, folder: Path, files: Iterable[Path]
-) -> list[Path]:
     summary = summarise(reduction, overview.klip and overview.klip.curve)
     pictures = ReportPictures.of(reduction, overview, summary)
     html, data = (folder / name for name in ("report.html", "summary.json"))
