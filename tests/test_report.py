@@ -41,9 +41,8 @@ ROLL = 30.0
 
 def reported(reduction, folder, files=()):
     """The paths of the report of a reduction alone, in a folder."""
-    return write_report(
-        reduction, Overview(SkyImages(reduction), Klip.of(reduction)), folder, files
-    )
+    overview = Overview(SkyImages(reduction), Klip.of(reduction))
+    return write_report(reduction, overview, folder, files)
 
 
 @cache
@@ -426,7 +425,7 @@ def test_calibrated_frames_have_flux_densities_on_the_page():
 def test_every_picture_has_words_and_nothing_is_loaded(folder):
     page = Tags((folder / "report.html").read_text(encoding="utf-8"))
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    # Three of the whole, the curve, two of the candidate, three of the frame and of the wavefront.
+    # Three of the whole, the curve, one of the candidate, three of the frame and of the wavefront.
     assert len(pictures) == 11
     for attributes in pictures:
         assert len(attributes["alt"] or "") > 30

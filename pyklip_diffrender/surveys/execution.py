@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-import os
 import socket
 import time
 import traceback
@@ -203,7 +202,6 @@ def _circumstances(began: float) -> dict[str, Any]:
         "seconds": round(time.perf_counter() - began, 3),
         "ended": datetime.now(UTC).isoformat(timespec="seconds"),
         "host": socket.gethostname(),
-        "process": os.getpid(),
     }
 
 
