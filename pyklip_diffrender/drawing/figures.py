@@ -138,9 +138,8 @@ def wide_panel() -> tuple[Figure, Axes]:
 
 def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
     """Write a figure in one step, in the format that the ending of the path names."""
-    form = Path(path).suffix.removeprefix(".").lower()
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=dpi, facecolor="white", format=form)
+        figure.savefig(temporary, dpi=dpi, facecolor="white", format=Path(path).suffix[1:])
 
 
 def to_png(figure: Figure, dpi: int = 150) -> bytes:
