@@ -49,7 +49,7 @@ def measurements(folder: Path) -> Iterator[tuple[str, list[str]]]:
     opd = str(opd_of(DATA, "HIP-65426"))
     yield "star_flux", ["benchmarks.star_flux", "--frames", frames, "--opd", opd]
     products = str(folder / "hip65426")
-    wide = ["detect", frames, "--opd", opd, "-o", products, "--wide", "--overwrite"]
+    wide = ["reduce", frames, "--opd", opd, "-o", products, "--wide", "--overwrite"]
     yield "wide", ["pyklip_diffrender", *wide]
 
 

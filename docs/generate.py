@@ -115,7 +115,7 @@ SITUATIONS = (
     ),
     Situation(
         "a binary or bright neighbour", "Fitted with the star.", {},
-        "`from_files(star=(x, y))` (`--star X,Y`) if a frame is refused because the neighbour is "
+        "`from_files(star=(x, y))` (`--star X Y`) if a frame is refused because the neighbour is "
         "taken for the star",
         "[Limits higher by its photon noise](../validation/neighbours.md), and a little more.",
     ),

@@ -34,7 +34,7 @@ Inside a package, and inside packages of that package, imports must form no circ
 OWNERS = {
     "astroquery": ("archive",), "dask": ("surveys",), "distributed": ("surveys",),
     "jinja2": ("reduction.pages",), "matplotlib": ("drawing",), "mpl_toolkits": ("drawing",),
-    "poppy": ("bridges",), "pyarrow": ("surveys",), "pyklip": ("pyklip_backend", "reduction.klip"),
+    "poppy": ("bridges",), "pyklip": ("pyklip_backend", "reduction.klip"),
     "spaceKLIP": ("spaceklip",), "stpsf": ("bridges", "wavefront.wss"), "webbpsf": ("bridges",),
 }  # fmt: skip
 """Libraries, and the packages or modules that alone may import them."""
@@ -192,7 +192,7 @@ def test_type_checkers_see_the_names_that_are_loaded_lazily():
 
 def test_what_is_installed_is_no_older_than_the_metadata_allow():
     bounds = lower_bounds()
-    assert {"torch", "numpy", "jinja2", "dask", "pyarrow", "astroquery", "stpsf"} <= set(bounds)
+    assert {"torch", "numpy", "jinja2", "dask", "astroquery", "stpsf"} <= set(bounds)
     for name, bound in bounds.items():
         with suppress(PackageNotFoundError):  # of an extra
             assert Version(version(name)) >= Version(bound), name

@@ -17,6 +17,7 @@ import pyklip_diffrender as dr
 from benchmarks.reliability import reliability, system
 from benchmarks.synthetic_searches import CURVATURE, PIXEL, found, noise, searched
 from pyklip_diffrender.detection import Motion, checked_motion
+from pyklip_diffrender.detection.combined_result import scales_of, star_of_filter, unmoved
 from pyklip_diffrender.detection.error_factor import ErrorFactor, structures_in_single_roll
 from pyklip_diffrender.detection.sky_map import Family, SkyStack
 from pyklip_diffrender.detection.templates import weigh
@@ -82,7 +83,11 @@ def test_it_is_the_joint_likelihood_of_all_frames(pair):
     assert both.unit == "Jy"
     pixels = [(3, 4), (12, 2), (7, 13)]
     places = np.array([both.maps[0].on_sky(grid[pixel]) for pixel in pixels])
-    table = both.measure(places * u.arcsec)
+    scales = scales_of(both.maps, both.unit)
+    filters = both.spectra.filters
+    stack = SkyStack.of(both.maps, filters, scales, places, unmoved(both.maps))
+    snr = np.einsum("kfn,fn->kn", stack.weights(both.spectra.flux), stack.snr)
+    amplitude_error = stack.amplitude_errors(both.spectra.flux)
     joint = stacked([each.groups[0][0] for each in pair])
     at = torch.from_numpy(np.array([grid[pixel] for pixel in pixels]))
     images = [each.groups[0][1].at(at)[0] for each in pair]
@@ -93,16 +98,16 @@ def test_it_is_the_joint_likelihood_of_all_frames(pair):
         templates = {f: flux[f] / stars[f] * image for f, image in enumerate(images)}
         matrix, vector = joint.normal_equations(templates)
         information = matrix.diagonal().numpy()
-        np.testing.assert_allclose(table["amplitude_error"][:, k], information**-0.5, rtol=1e-8)
-        scale = 1e-8 * np.sqrt(information)
-        assert np.all(np.abs(table["amplitude"][:, k] * information - vector.numpy()) < scale)
+        np.testing.assert_allclose(amplitude_error[k], information**-0.5, rtol=1e-8)
+        # The vector is the amplitude times the information, and the S/N that over its root.
+        assert np.all(np.abs(snr[k] - vector.numpy() / np.sqrt(information)) < 1e-8)
     # Free fluxes are those of both templates fitted together, which do not share pixels.
     zero, step = torch.zeros_like(images[0]), len(pixels)
     apart = {0: torch.cat([images[0], zero]), 1: torch.cat([zero, images[1]])}
     matrix, vector = joint.normal_equations(apart)
     both_fluxes = torch.linalg.solve(matrix[::step, ::step], vector[::step]).numpy()
-    measured = [table["contrast_F444W"][0], table["contrast_F356W"][0]]
-    errors = [table["contrast_error_F444W"][0], table["contrast_error_F356W"][0]]
+    of_star = np.array([star_of_filter(both.maps, name, scales) for name in filters])
+    measured, errors = stack.flux[:, 0] / of_star, stack.error[:, 0] / of_star
     assert np.all(np.abs(measured - both_fluxes) < 1e-8 * np.array(errors))
 
 

@@ -139,12 +139,9 @@ def test_factors_are_interpolated_and_never_below_their_floor():
     offsets = np.array([[0.3, 0.4], [0.0, -1.0]])
     np.testing.assert_allclose(factor.of(offsets), [1.0, 1.5], atol=0.01)
     np.testing.assert_allclose(factor.at([0.5, 1.0]), [1.0, 1.5], atol=0.01)
-    np.testing.assert_allclose(factor.at_least(1.2).of(offsets), [1.2, 1.5], atol=0.01)
     # Beyond the field the factors of its edge.
     assert factor.of(np.array([[9.0, 0.0]])) == pytest.approx(factor.factors[40, -1], rel=0.01)
     assert factor.at(9.0) == pytest.approx(factor.factors[0, 0], rel=0.01)
-    assert factor.is_needed
-    assert not error_factor.ErrorFactor.constant(1.0).is_needed
 
 
 def test_noise_exceeds_the_threshold_as_rarely_as_gaussian_noise():

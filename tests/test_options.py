@@ -22,16 +22,16 @@ SOURCE = Path(module.__file__)
 
 
 def test_every_option_is_on_the_command_line_or_has_a_reason():
-    for command in (application.commands["reduce"], application.commands["detect"]):
-        params = {each.opts[-1]: each for each in command.params if isinstance(each, click.Option)}
-        for option in OPTIONS.values():
-            if option.not_on_command_line:
-                assert option.flag not in params
-                continue
-            shown = params[option.flag]
-            assert shown.help == option.help != ""
-            if not option.is_switch:
-                assert shown.default == option.default
+    command = application.commands["reduce"]
+    params = {each.opts[-1]: each for each in command.params if isinstance(each, click.Option)}
+    for option in OPTIONS.values():
+        if option.not_on_command_line:
+            assert option.flag not in params
+            continue
+        shown = params[option.flag]
+        assert shown.help == option.help != ""
+        if not option.is_switch:
+            assert shown.default == option.default
 
 
 def test_every_option_is_a_key_of_surveys_or_has_a_reason():
@@ -95,7 +95,7 @@ def test_no_default_is_repeated():
                 known = OPTIONS.get(name)
                 if known is not None and value == known.default and value not in (None, False):
                     repeated.append(f"{path}:{line}: {name} = {value!r}")
-    # The image of psf has as many pixels only by chance.
+    # The frames of learn have as many pixels only by chance.
     assert [each for each in repeated if "application.py" not in each] == []
     assert len(repeated) <= 1
     planted = "def f(*, star_flux_error: float = 0.05): ...\noption('--threshold', default=5.0)"

@@ -9,7 +9,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
-from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.scene.objects import Planet
@@ -249,20 +248,3 @@ def test_a_detection_shows_candidates_and_the_curve(fit):
         np.testing.assert_array_equal(drawn[:, 1], curve[name])
     assert right.get_yscale() == "log"
     assert right.get_ylabel() == "contrast at 5 sigma"
-
-
-def test_ellipses_of_a_corner_are_those_of_the_covariance():
-    values = np.array([2.0, 400.0, -300.0])
-    covariance = np.array([[0.04, 0.3, 0.0], [0.3, 9.0, 4.0], [0.0, 4.0, 16.0]])
-    figure = drawing.corner(["a", "b", "c"], values, covariance, ["2.0", "400", "-300"])
-    axes = np.reshape(figure.axes, (3, 3))
-    for row, column in ((1, 0), (2, 0), (2, 1)):
-        pair = [column, row]
-        inverse = np.linalg.inv(covariance[np.ix_(pair, pair)])
-        for line, sigmas in zip(axes[row, column].lines, (1.0, 2.0), strict=False):
-            away = np.stack(line.get_data(), axis=1) - values[pair]
-            chi2 = np.einsum("ni,ij,nj->n", away, inverse, away)
-            np.testing.assert_allclose(chi2, sigmas**2)
-    bell = axes[1, 1].lines[0]
-    x, y = bell.get_data()
-    assert y[np.abs(x - 403.0).argmin()] == pytest.approx(np.exp(-0.5), abs=0.03)

@@ -25,11 +25,11 @@ import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.reduction import existing_products, pages, summarise, write_report
+from pyklip_diffrender.reduction import pages, summarise
 from pyklip_diffrender.reduction.extended_light import looks_extended
 from pyklip_diffrender.reduction.fit_status import advice
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
-from pyklip_diffrender.reduction.products import page
+from pyklip_diffrender.reduction.products import page, write_report
 from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.product_headers import world_coordinates
@@ -37,6 +37,12 @@ from pyklip_diffrender.scene.sequence import by_reason
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)
 ROLL = 30.0
+
+
+def reported(reduction, folder, files=()):
+    """The paths of the report of a reduction alone, in a folder."""
+    overview = Overview(SkyImages(reduction), Klip.of(reduction))
+    return write_report(reduction, overview, folder, files)
 
 
 @cache
@@ -419,14 +425,14 @@ def test_calibrated_frames_have_flux_densities_on_the_page():
 def test_every_picture_has_words_and_nothing_is_loaded(folder):
     page = Tags((folder / "report.html").read_text(encoding="utf-8"))
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    # Three of the whole, the curve, two of the candidate, three of the frame and of the wavefront.
-    assert len(pictures) == 12
+    # Three of the whole, the curve, one of the candidate, three of the frame and of the wavefront.
+    assert len(pictures) == 11
     for attributes in pictures:
         assert len(attributes["alt"] or "") > 30
         assert (attributes["src"] or "").startswith("data:image/png;base64,")
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
     assert all((a.get("src") or "data:").startswith("data:") for _, a in page.tags)
-    picture = pages.Picture("", drawing.panel()[0], "")
+    picture = pages.Picture(drawing.panel()[0], "")
     assert picture.uri.startswith("data:image/png;base64,iVBOR")
     # Links are to the files beside it.
     linked = {a["href"] for _, a in page.tags if "href" in a}
@@ -437,12 +443,12 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
 @pytest.mark.slow
 def test_a_header_cannot_write_into_the_page(tmp_path):
     result = replace(shown()["Reduction"], pattern=None, failed=((HOSTILE, HOSTILE),))
-    html, data = write_report(result, tmp_path, [tmp_path / HOSTILE.replace("/", "")])
+    html, data = reported(result, tmp_path, [tmp_path / HOSTILE.replace("/", "")])
     text = html.read_text(encoding="utf-8")
     assert text.count(str(escape(HOSTILE))) > 8
     tags = Tags(text).tags
     assert not [tag for tag, attributes in tags if tag == "script" or "onerror" in attributes]
-    assert len([tag for tag, _ in tags if tag == "img"]) == 12
+    assert len([tag for tag, _ in tags if tag == "img"]) == 11
     assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
 
 
@@ -463,7 +469,7 @@ def test_with_reference_frames_klip_is_shown_beside(tmp_path):
     unused = Contribution(star.name, star.target, "not used", "only 1 frame of its star")
     sequence = replace(sequence, excluded=())
     beside = replace(whole, sequence=sequence, failed=(), visit=Visit((unused,)))
-    html, data = write_report(beside, tmp_path)
+    html, data = reported(beside, tmp_path)
     summary = json.loads(data.read_text(encoding="utf-8"))
     curve = summary["klip_curve"]
     assert [each["use"] for each in summary["frames"]] == ["target", "KLIP only"]
@@ -598,7 +604,7 @@ def test_a_failure_of_klip_does_not_break_the_report(tmp_path, caplog):
     whole = reduction()
     (star,) = whole.sequence.science
     sequence = replace(whole.sequence, references=(star.cutout(10),))
-    _, data = write_report(replace(whole, sequence=sequence), tmp_path)
+    _, data = reported(replace(whole, sequence=sequence), tmp_path)
     assert "the report has no comparison with KLIP" in caplog.text
     assert json.loads(data.read_text(encoding="utf-8"))["klip_curve"] is None
 
@@ -606,7 +612,7 @@ def test_a_failure_of_klip_does_not_break_the_report(tmp_path, caplog):
 def test_a_report_that_fails_leaves_the_old_one(tmp_path):
     (tmp_path / "report.html").write_text("old")
     with pytest.raises(AttributeError):
-        write_report(replace(reduction(), wide=cast(Any, "broken")), tmp_path)
+        reported(replace(reduction(), wide=cast(Any, "broken")), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
 
@@ -635,24 +641,6 @@ def test_the_report_says_who_is_deeper_where(klip, said):
     assert said in pages.depth_against_klip(curve, other)
     assert pages.depth_against_klip(curve, None) == ""
     assert pages.depth_against_klip(curve | {"separation_arcsec": [0.1, 0.2]}, other) == ""
-
-
-@pytest.mark.slow
-def test_every_figure_is_a_file_of_its_own(tmp_path):
-    whole = reduction()
-    written = whole.write(tmp_path, figures="pdf")
-    drawn = sorted(path for path in written if path.parent.name == "figures")
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert len(drawn) == text.count("<figure>") == 12
-    assert all(path.read_bytes().startswith(b"%PDF") for path in drawn)
-    assert 'href="figures/"' in text
-    mine = tmp_path / "figures" / "mine.pdf"
-    mine.write_bytes(b"mine")
-    assert set(existing_products(tmp_path)) == set(written)
-    whole.write(tmp_path, overwrite=True)
-    assert list((tmp_path / "figures").iterdir()) == [mine]
-    with pytest.raises(IncompatibleSetupError, match="figures: got 'eps', expected one of pdf"):
-        whole.write(tmp_path, overwrite=True, figures=cast(Any, "eps"))
 
 
 def shown():
@@ -713,7 +701,7 @@ report.textContent = JSON.stringify({
 
 @pytest.fixture(scope="module")
 def whole_page(tmp_path_factory):
-    html, _ = write_report(reduction(), tmp_path_factory.mktemp("page"))
+    html, _ = reported(reduction(), tmp_path_factory.mktemp("page"))
     return html.read_text(encoding="utf-8")
 
 

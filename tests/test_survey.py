@@ -6,20 +6,18 @@ import sys
 import time
 from dataclasses import replace
 from datetime import date
-from functools import partial
 from math import inf
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import Table
 from survey_stubs import HOSTILE, Tags, configuration, inputs, result, stub
 
 import pyklip_diffrender as dr
 from benchmarks import faults
 from benchmarks.calints_files import SIDE, calints
-from benchmarks.synthetic_searches import searched, write_searched
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.surveys import execution
@@ -117,9 +115,6 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
         ((1,), "wide", "yes", ["sequence 2: wide", "true or false"]),
         ((), "options", {"settings": {"tolerance": []}}, ["options: settings", "wrong type"]),
         ((), "options", {"disk": True, "wide": True}, ["options", "one of them"]),
-        ((), "combined", {"spectra": ["no.ecsv"]}, ["combined: spectra", "no.ecsv", "'flat'"]),
-        ((), "combined", {"spectra": []}, ["combined: spectra", "[]"]),
-        ((), "combined", {"parallax": 0.1}, ["combined: got the key 'parallax'", "spectra"]),
         ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
         ((), "injections", {"contrasts": [12.5]}, ["contrasts", "no magnitudes"]),
         ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
@@ -409,24 +404,20 @@ def test_a_worker_that_sees_something_else_says_so(tmp_path, what):
     assert jobs.exists() == (what != "output")
 
 
-def test_the_tables_say_the_same(tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
+def test_the_table_that_is_written_is_that_which_is_returned(tmp_path):
     config = inputs(tmp_path / "data", 2)
     config["sequence"][0]["injections"] = PLANET
     table = run_survey(config, tmp_path / "out", stub)
     ecsv = Table.read(tmp_path / "out" / "results.ecsv")
-    rows = parquet.read_table(tmp_path / "out" / "results.parquet").to_pylist()
-    assert len(rows) == len(ecsv) == len(table) == 3
-    for mine, row, theirs in zip(table, rows, ecsv, strict=True):
+    assert len(ecsv) == len(table) == 3
+    for mine, theirs in zip(table, ecsv, strict=True):
         for name in table.colnames:
-            value = None if np.ma.is_masked(mine[name]) else mine[name]
-            assert row[name] == value
-            assert np.ma.is_masked(theirs[name]) if value is None else theirs[name] == value
-    assert rows[0]["snr"] == 30.0
-    assert rows[0]["candidates"] == 1
-    assert rows[0]["limit_1.0_arcsec"] == 1e-5
-    assert rows[0]["limit_2.0_arcsec"] is None
-    assert rows[0]["peak_memory_bytes"] > 1e6
+            is_masked = np.ma.is_masked(mine[name])
+            assert np.ma.is_masked(theirs[name]) if is_masked else theirs[name] == mine[name]
+    assert table["snr"][0] == 30.0
+    assert table["candidates"][0] == 1
+    assert table["limit_1.0_arcsec"][0] == 1e-5
+    assert np.ma.is_masked(table["limit_2.0_arcsec"][0])
 
 
 def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path, monkeypatch):
@@ -453,111 +444,15 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path, monkeypa
     assert all((output / link).exists() for link in links)
 
 
-STAR = {"TARGPROP": "HD 1", "TARG_RA": 10.0, "TARG_DEC": 5.0}
-OTHER = {"TARGPROP": "HD 2", "TARG_RA": 90.0, "TARG_DEC": 5.0}
-PLACE = (0.6, 0.35)
-
-SEARCHED = {
-    "star0_calints": partial(searched, "F444W", 1, [(*PLACE, 4.2)], north=20.0, header=STAR),
-    "star1_calints": partial(searched, "F356W", 2, [(*PLACE, 4.0)], header=STAR),
-    "star2_calints": partial(searched, "F300M", 3, [(-0.5, 0.4, 30.0)], known=True,
-                             status="MODEL_MISMATCH", header=STAR),
-    "star3_calints": partial(searched, "F444W", 4, header=OTHER),
-}  # fmt: skip
-"""Searches by the name of the job: a planet that is too faint for each of two filters, a fit that
-does not explain its data, and another star."""
-
-
-def searching(job, folder):
-    """A job whose search is one of `SEARCHED`; nothing is fitted."""
-    write_searched(SEARCHED[job.name](), folder)
-    return result()
-
-
-def test_filters_of_a_star_are_searched_together_at_the_end(tmp_path, command, capsys):
-    assert command(searching, 4) == 0
-    said = capsys.readouterr().out
-    assert said.count("all filters and epochs") == 1
-    # 4.1 sqrt(2) and the noise of these seeds; each filter alone needs 5.
-    assert "HD 1, all filters and epochs: S/N 5.4 at 0.698 arcsec" in said
-    (folder,) = (tmp_path / "out" / "combined").iterdir()
-    assert folder.name.startswith("HD-1_")
-    assert sorted(each.name for each in folder.iterdir()) == [
-        "combined.fits", "combined_candidates.ecsv", "combined_limits.ecsv", "comparison.html",
-        "comparison.json",
-    ]  # fmt: skip
-    (row,) = QTable.read(folder / "combined_candidates.ecsv")
-    assert np.hypot(row["delta_ra"].value - PLACE[0], row["delta_dec"].value - PLACE[1]) < 0.06
-    text = (tmp_path / "out" / "survey.html").read_text(encoding="utf-8")
-    section = text.partition("Filters and epochs together")[2].partition("</section>")[0]
-    assert "MODEL_MISMATCH" in section
-    assert "HD 2" not in section
-    (link,) = (each["href"] for tag, each in Tags(section).tags if tag == "a")
-    page = folder / "comparison.html"
-    assert (tmp_path / "out" / link).samefile(page)
-    links = [each.get("href", "") for _, each in Tags(page.read_text(encoding="utf-8")).tags]
-    reports = [folder / each for each in links if "report.html" in each]
-    assert len(reports) == 3
-    assert all(each.exists() for each in reports)
-
-
-def test_a_combined_search_is_kept_until_its_jobs_or_spectra_change(tmp_path, caplog):
-    caplog.set_level("INFO")
-    config = inputs(tmp_path / "data", 3)
-    output, first = tmp_path / "out", {**config, "sequence": config["sequence"][:2]}
-
-    def combined(config):
-        (made,) = run_survey(config, output, searching).meta["combined"]
-        return made
-
-    before = combined(first)
-    assert before["filters"] == ["F444W", "F356W"]
-    page = output / before["folder"] / "comparison.html"
-    page.write_text("kept")
-    assert combined(first) == before
-    assert page.read_text() == "kept"
-    assert caplog.text.count("combined search of") == 1
-    # A damaged one is made again.
-    page.with_name("comparison.json").write_text("{")
-    assert combined(first) == before
-    assert page.read_text() != "kept"
-    flat = combined({**first, "combined": {"spectra": ["flat"]}})
-    assert [each["name"] for each in flat["spectra"]] == ["flat"]
-    assert not flat["free"]
-    assert len({each["folder"] for each in (before, flat, combined(config))}) == 3
-    assert hidden(output) == []
-    assert not [each for each in (output / "combined").iterdir() if each.name.startswith(".")]
-
-
-def test_what_cannot_be_searched_together_is_said(tmp_path, command, capsys, monkeypatch):
-    """Two jobs of one frame with other options are one observation; epochs need a motion."""
-    later = partial(searched, "F444W", 5, mjd=60400.0, header=STAR)
-    monkeypatch.setitem(SEARCHED, "wide", SEARCHED["star0_calints"])
+def test_without_the_extra(tmp_path, monkeypatch):
     config = inputs(tmp_path / "data", 1)
-    config["sequence"].append({**config["sequence"][0], "name": "wide", "wide": True})
-    (twice,) = run_survey(config, tmp_path / "twice", searching).meta["combined"]
-    assert "its frames are also in F444W 2023-02-25" in twice["reason"]
-    monkeypatch.setitem(SEARCHED, "star1_calints", later)
-    assert command(searching, 2) == 0
-    words = "no combined search: combine: got reductions of several epochs"
-    assert f"HD 1: {words}" in capsys.readouterr().out
-    assert words in (tmp_path / "out" / "survey.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("missing", ["dask", "pyarrow"])
-def test_without_the_extra(tmp_path, monkeypatch, missing):
-    config = inputs(tmp_path / "data", 1)
-    for name in [each for each in sys.modules if each.split(".")[0] == missing]:
+    for name in [each for each in sys.modules if each.split(".")[0] == "dask"]:
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setitem(sys.modules, f"{missing}.distributed", None)
-    found = "pyklip_diffrender.surveys.survey_page.find_spec"
-    monkeypatch.setattr(found, lambda name: None if name == missing else 1)
-    if missing == "dask":
-        with pytest.raises(IncompatibleSetupError, match=r"pip install .dask\[.*workers = 0"):
-            run_survey({**config, "workers": 1}, tmp_path / "out", stub)
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    with pytest.raises(IncompatibleSetupError, match=r"pip install .dask\[.*workers = 0"):
+        run_survey({**config, "workers": 1}, tmp_path / "out", stub)
     assert list(run_survey(config, tmp_path / "out", stub)["status"]) == ["finished"]
     assert (tmp_path / "out" / "results.ecsv").exists()
-    assert (tmp_path / "out" / "results.parquet").exists() == (missing != "pyarrow")
 
 
 @pytest.mark.parametrize("broken", [False, True])
@@ -567,11 +462,8 @@ def test_the_command_says_what_came_of_it(tmp_path, command, capsys, broken):
     assert command(work, 2, planet) == int(broken)
     said = capsys.readouterr().out
     assert f"{3 - 2 * broken} of 3 jobs finished, {2 * broken} failed" in said
-    # The injected planet, which the stub finds beside star 1, is no candidate.
-    assert said.count("S/N") == 2 - broken
-    assert "star0_calints: S/N 30.0 at 0.820 arcsec" in said
     assert ("star1_calints failed: ValueError: no such star" in said) == broken
-    assert f"wrote {tmp_path / 'out' / 'survey.html'}" in said
+    assert f" and {tmp_path / 'out' / 'survey.html'}" in said
 
 
 def test_an_interrupted_command_says_that_it_can_go_on(tmp_path, command, capsys):

@@ -10,7 +10,6 @@ from astropy.io import fits
 from astropy.time import Time
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.cli.reducing import describe_steps
 from pyklip_diffrender.detection import sources_of_references
 from pyklip_diffrender.detection.error_factor import structures_in_single_roll
 from pyklip_diffrender.pattern import (
@@ -133,8 +132,7 @@ def test_references_make_the_limits_deeper_and_leave_the_planet_alone():
         assert each.flux == pytest.approx(2.0, rel=0.05)
         assert 0.4 < each.chi2 < 1.3
         assert 0 < each.drift < 6
-    assert len(visit.table) == 3
-    assert visit.table["drift"].unit == u.nm
+    assert len(visit.contributions) == 3
     detection = dr.detect(fit)
     candidate_of(detection)
     distant = np.hypot(*np.moveaxis(detection.grid, -1, 0)) > 0.3
@@ -275,29 +273,23 @@ def test_a_pattern_is_not_learned_twice_from_a_reference():
     assert pattern_for_visit(replace(choice, origin="none"), science()[:1], elsewhere) is None
 
 
-TEACHING, TOGETHER = "reference star HD 2", "reference stars and target together"
-
-
 @pytest.mark.parametrize(
-    ("near", "far", "options", "planned", "alone"),
+    ("near", "far", "options", "teaching", "joining"),
     [
-        (3, 0, {}, [TOGETHER], 0),
-        (1, 0, {}, [TOGETHER], 0),
-        (1, 2, {}, [TEACHING, TOGETHER], 0),
-        (3, 2, {}, [TEACHING, TOGETHER], 0),
-        (0, 2, {"references": "off"}, [], 2),
-        (0, 2, {"pattern": "off"}, [], 2),
-        (1, 1, {"references": "pattern"}, [TEACHING], 0),
+        (3, 0, {}, 0, 3),
+        (1, 2, {}, 2, 1),
+        (1, 2, {"pattern": "references"}, 3, 1),
+        (1, 2, {"disk": True}, 3, 0),
+        (1, 2, {"references": "off"}, 0, 0),
+        (1, 1, {"references": "pattern"}, 2, 0),
     ],
 )
-def test_a_plan_has_what_reference_frames_are_used_for(near, far, options, planned, alone):
+def test_what_reference_frames_are_used_for(near, far, options, teaching, joining):
     references = (*(reference(k) for k in range(near)), *(later(k) for k in range(far)))
     sequence = dr.ExposureSequence("HD 1", science(), references)
-    steps = describe_steps(sequence, ReduceOptions(size=SIZE, **options)).splitlines()
-    names = [each.partition(". ")[2] for each in steps]
-    assert [name for name in names if name in (TEACHING, TOGETHER)] == planned
-    only = f", with {alone} reference frame{'' if alone == 1 else 's'} for KLIP only"
-    assert names[-1] == f"products{only if alone else ''}"
+    options = ReduceOptions(size=SIZE, **options)
+    assert len(pipeline.frames_for_pattern(sequence, options)) == teaching
+    assert len(pipeline.frames_in_likelihood(sequence, options)) == joining
 
 
 FLAT_FIELD = "jwst_nircam_flat_0001.fits"

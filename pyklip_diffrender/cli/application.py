@@ -7,7 +7,7 @@ import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,14 +19,14 @@ from pyklip_diffrender.cli.session import (
     Command,
     Run,
     archive,
+    claim_file,
+    claim_folder,
     common,
     declared,
     file_type,
-    free_memory,
     importing,
     keep_freed_memory,
     named_files,
-    open_streams,
     option,
     outputs,
     require_frames,
@@ -35,7 +35,7 @@ from pyklip_diffrender.cli.session import (
     together,
     wavefront,
 )
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, RefinementError
+from pyklip_diffrender.errors import DiffrenderError
 
 if TYPE_CHECKING:
     from pyklip_diffrender.scene.sequence import ExposureSequence
@@ -77,7 +77,7 @@ def demo(
     Needs no data, half a minute and 2 GB of memory.
     """
     products = named_files(output, _DEMO, overwrite)
-    run.claim_folder(output, _DEMO)
+    claim_folder(output, _DEMO)
     with importing():
         from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
         from pyklip_diffrender.drawing import save
@@ -119,29 +119,6 @@ def demo(
     require_in_place(products)
 
 
-def _star_callback(
-    ctx: click.Context, parameter: click.Parameter, text: str | None
-) -> tuple[float, float] | None:
-    """The position of a star from "x,y"."""
-    if text is None:
-        return None
-    try:
-        x, y = (float(part) for part in str(text).strip("()[] ").split(","))
-    except ValueError:
-        raise click.BadParameter(
-            f"got {text!r}, expected x,y of the star in pixels from 0, such as 150,174.2",
-            ctx, parameter,
-        ) from None  # fmt: skip
-    return x, y
-
-
-_STAR = option(
-    "--star", metavar="X,Y", section="Frames", callback=_star_callback,
-    help="Where the target's star is in its files, pixels from 0, in place of what the headers say "
-         "and whatever else the frames show.",
-)  # fmt: skip
-
-
 @click.command(
     "reduce",
     cls=Command,
@@ -150,6 +127,7 @@ Examples:
   pyklip-diffrender reduce frames --opd maps -o products
   pyklip-diffrender reduce frames --target G-7-34 --filter F444W --opd map.fits -o products
   pyklip-diffrender reduce frames --opd maps -o products --dry-run
+  pyklip-diffrender reduce calints.fits --opd flat -o products
   pyklip-diffrender reduce --program 1184 --target G-7-34 --filter F444W --opd map.fits -o out""",
 )
 @click.argument("frames", type=file_type(), nargs=-1)
@@ -161,7 +139,11 @@ Examples:
     section="Frames",
     help="Which filter; default: all of the target's, one by one.",
 )
-@_STAR
+@option(
+    "--star", type=float, nargs=2, metavar="X Y", section="Frames",
+    help="Where the target's star is in its files, pixels from 0, in place of what the headers say "
+         "and whatever else the frames show.",
+)  # fmt: skip
 @archive
 @wavefront
 @search
@@ -205,113 +187,6 @@ def reduce_frames(
         from pyklip_diffrender.cli.reducing import run_reduction
 
     run_reduction(run, read, **options)
-
-
-@click.command(
-    "detect",
-    cls=Command,
-    epilog="""\b
-Examples:
-  pyklip-diffrender detect calints.fits --opd map.fits -o products
-  pyklip-diffrender detect calints.fits --opd maps --opd-date before -o products
-  pyklip-diffrender detect calints.fits --opd maps -o products --json | jq .sentence""",
-)
-@click.argument("frames", type=file_type())
-@_STAR
-@wavefront
-@search
-@outputs()
-@click.pass_obj
-def detect_in_file(
-    run: Run, /, frames: Path, star: tuple[float, float] | None, **options: Any
-) -> None:
-    """Subtract the star from a single file and search for planets.
-
-    FRAMES is a calints file.
-    """
-
-    def read() -> tuple[ExposureSequence, ...]:
-        from pyklip_diffrender.scene.sequence import ExposureSequence
-
-        if frames.is_dir():
-            raise IncompatibleSetupError(
-                f"{frames} is a folder, expected a file; the command reduce takes folders"
-            )
-        return (ExposureSequence.from_files([frames], star=star),)
-
-    with importing():
-        from pyklip_diffrender.cli.reducing import run_reduction
-
-    run_reduction(run, read, **options)
-
-
-@click.command(
-    cls=Command,
-    epilog="""\b
-Examples:
-  pyklip-diffrender psf --filter F356W --offset 0.02 0 -o star.fits
-  pyklip-diffrender psf --filter F460M --mask MASKLWB -o star.fits
-  pyklip-diffrender psf --monochromatic 4.5e-6 --opd map.fits -o star.fits""",
-)
-@option("--filter", default="F444W", show_default=True, metavar="NAME", help="Filter of NIRCam.")
-@option("--mask", default="MASK335R", show_default=True, metavar="NAME",
-        help="Coronagraph mask of NIRCam.")  # fmt: skip
-@option("--monochromatic", type=float, metavar="M", help="A single wavelength, m.")
-@option("--opd", default="flat", show_default=True, metavar="FILE|flat",
-        help="OPD map: a FITS file, or flat.")  # fmt: skip
-@option("--size", type=click.IntRange(min=1), default=80, show_default=True, metavar="N",
-        help="Side of the image, pixels.")  # fmt: skip
-@option("--offset", type=float, nargs=2, default=(0.0, 0.0), show_default=True,
-        metavar="X Y", help="Star from the occulter's centre, arcsec.")  # fmt: skip
-@outputs(file="The FITS file to write.")
-@click.pass_obj
-def psf(
-    run: Run,
-    output: Path,
-    filter: str,
-    mask: str,
-    monochromatic: float | None,
-    opd: str,
-    size: int,
-    offset: tuple[float, float],
-    overwrite: bool,
-) -> None:
-    """Write the image of a star behind the coronagraph."""
-    run.claim_file(output)
-    from pyklip_diffrender.io.files import require_new, write_fits
-
-    require_new([output], overwrite)
-    import numpy as np
-    from astropy.io import fits
-
-    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.io.headers import fits_text
-    from pyklip_diffrender.optics.grid import resample
-    from pyklip_diffrender.wavefront.opd import as_opd_map
-
-    model = nircam_coronagraph(
-        filter,
-        image_mask=mask,
-        monochromatic=monochromatic,
-        fov_pixels=size,
-        device=run.device,
-    )
-    edge = size / 2 * min(model.detector.pixelscale)
-    if not np.abs(offset).max() < edge:
-        raise IncompatibleSetupError(
-            f"--offset: got {offset[0]:g} {offset[1]:g}, expected a star inside the image, less "
-            f"than {edge:.3g} arcsec from its centre along x and y. Choose a larger --size"
-        )
-    map_ = as_opd_map(opd)
-    pixels = model.calc_psf(opd=resample(map_.data, model.npix), star_offset=offset)["DET_SAMP"]
-    hdu = fits.PrimaryHDU(pixels.data, pixels.header)
-    del hdu.header["EXTNAME"]
-    hdu.header["BUNIT"] = ("", "fraction of the light that the pupil collects")
-    hdu.header["PUPILOPD"] = (fits_text(map_.name), "Pupil OPD source")
-    hdu.header["STAROFFX"] = (offset[0], "x of the star from the mask's centre, arcsec")
-    hdu.header["STAROFFY"] = (offset[1], "y of the star from the mask's centre, arcsec")
-    write_fits(fits.HDUList([hdu]), output)
-    click.echo(f"wrote {output}")
 
 
 @click.command(
@@ -416,7 +291,7 @@ def learn(
     same command goes on where an earlier one was stopped.
     """
     require_frames(frames, program)
-    run.claim_file(output)
+    claim_file(output)
     products = named_files(output.parent, (output.name,), overwrite)
     from pyklip_diffrender.archive import fetch_calints
     from pyklip_diffrender.cli.reducing import opd_of
@@ -458,9 +333,6 @@ _REPORTED_LIBRARIES = (
     "torch", "numpy", "scipy", "astropy", "poppy", "photutils", "pyklip", "matplotlib",
 )  # fmt: skip
 
-_FAILED_CHI2 = 1.5
-"""Chi-squared per pixel above which the self-test has failed; 0.8 is usual."""
-
 
 def check_libraries(names: Iterable[str] = _REPORTED_LIBRARIES) -> str:
     """Import libraries that the package needs; returns their versions."""
@@ -472,96 +344,33 @@ def check_libraries(names: Iterable[str] = _REPORTED_LIBRARIES) -> str:
 
 
 def check_data() -> str:
-    """Read the library that comes with the package; the self-test reads the instrument's tables."""
+    """Read the library that comes with the package."""
     from pyklip_diffrender.pattern.library import package_library
 
     return f"{len(package_library().patterns)} detector patterns"
 
 
-def check_stpsf() -> str:
-    """Look for stpsf, which is optional, and its data."""
-    try:
-        name = f"stpsf {version('stpsf')}"
-    except PackageNotFoundError:
-        return "without stpsf, which only bridges and maps from MAST need"
-    folder = os.environ.get("STPSF_PATH") or os.environ.get("WEBBPSF_PATH")
-    if not folder:
-        return f"{name}, without its data: STPSF_PATH is not set"
-    if not Path(folder, "version.txt").is_file():
-        raise IncompatibleSetupError(
-            f"STPSF_PATH: got {folder}, expected the folder with the data files of {name}, which "
-            "has a version.txt. Set it, or unset it"
-        )
-    return f"{name}, with data in {folder}"
-
-
 def check_machine() -> str:
-    """Look at processors, GPUs and memory."""
+    """Look at processors and GPUs."""
     import torch
 
     gpus = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
-    free = free_memory()
     return (
         f"{torch.get_num_threads()} threads on {os.cpu_count()} processors, "
         f"{', '.join(gpus) or 'no GPU'}"
-        + ("" if free is None else f", {free / 1e9:.1f} GB of memory are free")
     )
 
 
-def check_fit(**settings: Any) -> str:
-    """Simulate a telescope whose segments have moved, and refine its wavefront.
-
-    `settings` are arguments of `FitSettings`, besides the basis. Raises RefinementError if the fit
-    is not as good as it should be.
-    """
-    import numpy as np
-    import torch
-
-    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.optics.grid import PupilGrid
-    from pyklip_diffrender.refinement import FitSettings, refine
-    from pyklip_diffrender.scene.objects import Scene
-    from pyklip_diffrender.scene.simulation import simulate
-    from pyklip_diffrender.wavefront.bases import SegmentMotions
-    from pyklip_diffrender.wavefront.opd import random_opd
-
-    # The mirror is coarsely sampled and nothing but its segments moves, so that seconds suffice.
-    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=96, fov_pixels=24)
-    basis, measured = SegmentMotions(), random_opd(1, npix=model.npix).data
-    motions = 1e-8 * np.random.default_rng(2).normal(size=len(basis))
-    truth = measured + basis.opd(torch.from_numpy(motions), PupilGrid.full(model.npix)).numpy()
-    frame = simulate(model, Scene(), truth, seed=1)
-    fit = refine(model, frame, measured, settings=FitSettings(basis=basis, **settings))
-    lit = model.entrance.lit.numpy()
-    before, after = (1e9 * float(np.std((opd - truth)[lit])) for opd in (measured, fit.wavefront))
-    text = (
-        f"self-test: the error of the wavefront fell from {before:.1f} to {after:.1f} nm, with "
-        f"chi-squared {fit.chi2_per_pixel:.2f} per pixel"
-    )
-    if fit.status.usable and after < 0.5 * before and fit.chi2_per_pixel < _FAILED_CHI2:
-        return text
-    raise RefinementError(
-        f"{text}, expected below {0.5 * before:.1f} nm and {_FAILED_CHI2}. Do not use results of "
-        "this installation; look at the versions above", fit,
-    )  # fmt: skip
-
-
-CHECKS: tuple[Callable[[], str], ...] = (
-    check_libraries,
-    check_data,
-    check_stpsf,
-    check_machine,
-    check_fit,
-)
+CHECKS: tuple[Callable[[], str], ...] = (check_libraries, check_data, check_machine)
 
 
 @click.command(cls=Command)
 @common
 @click.pass_obj
 def doctor(run: Run) -> int:
-    """Check libraries, data files, machine, and a small fit.
+    """Check libraries, data files and machine; demo fits a simulated star.
 
-    Takes about five seconds. The exit status is 1 if a check fails.
+    The exit status is 1 if a check fails.
     """
     failed = False
     for check in CHECKS:
@@ -581,22 +390,18 @@ _log = logging.getLogger(__name__)
     subcommand_metavar="COMMAND ...",
 )
 @click.version_option(__version__, prog_name=PROGRAM, message="%(prog)s %(version)s")
-@common
-def application(**_: Any) -> None:
+def application() -> None:
     """Find planets in JWST coronagraphic images by refining the wavefront.
 
-    `pyklip-diffrender COMMAND --help` explains a command. The general options may stand before
-    the command or after it.
+    `pyklip-diffrender COMMAND --help` explains a command.
     """
 
 
 for _command in (
     demo,
     reduce_frames,
-    detect_in_file,
     learn,
     survey,
-    psf,
     doctor,
 ):
     application.add_command(_command)
@@ -612,14 +417,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     keep_freed_memory()
     run = Run()
-    with open_streams(), run.messages():
+    with run.messages():
         try:
             status = application.main(arguments, prog_name=PROGRAM, standalone_mode=False, obj=run)
         except click.ClickException as error:
             error.show()
             return error.exit_code
         except (click.Abort, KeyboardInterrupt):
-            _log.error("interrupted; %s", run.left())
+            _log.error("interrupted; products that were written are complete")
             return 130
         except (DiffrenderError, OSError) as error:
             _log.error("%s", error)

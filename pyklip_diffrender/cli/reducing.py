@@ -1,19 +1,18 @@
-"""The work of the commands `reduce`, `detect` and `survey`."""
+"""The work of the commands `reduce` and `survey`."""
 
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import nullcontext, redirect_stdout, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from json import dumps, loads
+from json import loads
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 
-from pyklip_diffrender.cli.session import Run, named_files, require_in_place
+from pyklip_diffrender.cli.session import Run, claim_folder, named_files, require_in_place
 from pyklip_diffrender.detection import COMBINED, Combination, checked_motion
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
@@ -21,12 +20,6 @@ from pyklip_diffrender.instrument.spectrum import star_flux_density
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.options import Accuracy, ReduceOptions
-from pyklip_diffrender.pattern import (
-    PatternLibrary,
-    combine_libraries,
-    known_pattern,
-    package_library,
-)
 from pyklip_diffrender.reduction import (
     COMPARISON,
     PRODUCTS,
@@ -38,14 +31,13 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
 from pyklip_diffrender.scene.sequence import SHORT, ExposureSequence, by_reason
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_opd
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
-# The work of the commands `reduce` and `detect`.
+# The work of the command `reduce`.
 
 _MAST = "mast"
 """Value of --opd for maps that come from MAST."""
@@ -97,67 +89,54 @@ def run_reduction(
     *,
     output: Path,
     overwrite: bool,
-    json: bool,
     dry_run: bool,
     derivatives: bool,
-    figures: Literal["pdf", "png", "svg"] | None,
-    spectra: tuple[str, ...] = (),
-    proper_motion: tuple[str, str] | None = None,
-    parallax: str | None = None,
+    spectra: tuple[str, ...],
+    proper_motion: tuple[str, str] | None,
+    parallax: str | None,
     **options: Any,
 ) -> None:
     """Reduce the epochs and filters of a target, write all products and say what they show.
 
     A dry run makes all the checks of a run, and stops before the first fit.
     """
-    if dry_run and json:
-        raise click.UsageError("A --dry-run has no summary to print with --json.")
     try:
         checked_motion(proper_motion, parallax)
     except DiffrenderError as error:
         raise click.UsageError(str(error)) from error
     start = _Start.checked(device=run.device, **options)
     # What is there now may be replaced if the user says so, but not what other runs write later.
-    writing: dict[str, Any] = {
-        "derivatives": derivatives, "figures": figures, "overwrite": overwrite,
-    }  # fmt: skip
+    writing = {"derivatives": derivatives, "overwrite": overwrite}
     whole = ProductFolder(output, **writing)
-    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
+    claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
     above = named_files(output, (*COMPARISON, *COMBINED), overwrite)
     earlier = [ProductFolder(each, overwrite=True) for each in _listed(output)]
-    # Libraries may print, too.
-    with redirect_stdout(sys.stderr) if json else nullcontext():
-        sequences = read()
-        if not sequences:
-            return
-        several = len(sequences) > 1
-        folders = [output / name for name in _names(sequences)] if several else [output]
-        written = [ProductFolder(each, **writing) for each in folders] if several else [whole]
-        _require_flux_and_spectra(sequences, start.options, spectra)
-        prepared = []
-        for sequence, folder in zip(sequences, folders, strict=True):
-            if several:
-                run.claim_folder(folder, tuple(PRODUCTS))
-                click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
-            prepared.append(start.prepared(sequence))
-            if dry_run:
-                click.echo(describe_steps(prepared[-1].sequence, prepared[-1].options))
-        if dry_run:
-            return
-        summaries = {
-            products.folder: _reduced(preparation, products, progress=run.progress)
-            for preparation, products in zip(prepared, written, strict=True)
-        }
-        place = above.place() if several else output
-        above.clear()
-        _clear([whole, *earlier], folders)
-        (summary, *_) = summaries.values()
+    sequences = read()
+    if not sequences:
+        return
+    several = len(sequences) > 1
+    folders = [output / name for name in _names(sequences)] if several else [output]
+    written = [ProductFolder(each, **writing) for each in folders] if several else [whole]
+    _require_flux_and_spectra(sequences, start.options, spectra)
+    prepared = []
+    for sequence, folder in zip(sequences, folders, strict=True):
         if several:
-            search = {"spectra": spectra or SPECTRA, "star": start.star_sed}
-            motion = {"motion": proper_motion, "parallax": parallax}
-            summary = _compared(summaries, place, **search, **motion)
-    if json:
-        click.echo(dumps(summary, indent=2))
+            claim_folder(folder, tuple(PRODUCTS))
+            click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
+        prepared.append(start.prepared(sequence))
+    if dry_run:
+        return
+    summaries = {
+        products.folder: _reduced(preparation, products, progress=run.progress)
+        for preparation, products in zip(prepared, written, strict=True)
+    }
+    place = above.place() if several else output
+    above.clear()
+    _clear([whole, *earlier], folders)
+    if several:
+        search = {"spectra": spectra or SPECTRA, "star": start.star_sed}
+        motion = {"motion": proper_motion, "parallax": parallax}
+        _compared(summaries, place, **search, **motion)
     require_in_place(*written, above)
 
 
@@ -184,57 +163,20 @@ def _reduced(preparation: Preparation, products: ProductFolder, *, progress: boo
     return summary
 
 
-def _compared(summaries: Mapping[Path, Any], place: Path, **search: Any) -> Any:
+def _compared(summaries: Mapping[Path, Any], place: Path, **search: Any) -> None:
     """Search finished reductions together, and compare them on a page in the folder `place`.
 
     `summaries` are by the folders of the reductions, and `search` the arguments of
-    `search_together`. Returns the content of ``comparison.json``.
+    `search_together`.
     """
     combination = search_together(list(summaries), **search)
     named = {
         Path(os.path.relpath(folder, place)).as_posix(): each for folder, each in summaries.items()
     }
-    page, data = write_comparison(named, place, combination)
+    page, _ = write_comparison(named, place, combination)
     if isinstance(combination, Combination):
         combination.write(place)
     click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
-    return loads(read_text(data))
-
-
-def describe_steps(sequence: ExposureSequence, options: ReduceOptions) -> str:
-    """The steps of a reduction of a cut sequence, one in each line."""
-    pattern = options.pattern
-    searched = pattern == "auto" or isinstance(pattern, PatternLibrary)
-    libraries = [pattern] if isinstance(pattern, PatternLibrary) else []
-    library = combine_libraries([*libraries, package_library()])
-    known = searched and known_pattern(sequence.science[0], library=library) is not None
-    teaching, joining = (
-        frames(sequence, options) for frames in (frames_for_pattern, frames_in_likelihood)
-    )
-    steps = []
-    if known or not (searched or pattern == "references"):
-        teaching = ()
-    if known:
-        unplaced = [each.name for each in sequence.science if each.first_pixel is None]
-        steps += [f"place of {name} on the detector" for name in unplaced]
-    steps += [f"reference star {star}" for star in dict.fromkeys(e.target for e in teaching)]
-    steps.append("wavefront")
-    if joining:
-        steps.append("reference stars and target together")
-    steps.append("search")
-    if options.disk:
-        steps += ["extended light, and wavefront without it", "search without extended light"]
-    if options.wide:
-        steps.append("whole frames")
-    if options.injections:
-        steps.append(f"{options.injections} injected planets")
-    if options.completeness:
-        steps.append("completeness")
-    used = [*teaching, *joining]
-    unused = sum(not any(each is one for one in used) for each in sequence.references)
-    only = f", with {unused} reference frame{'' if unused == 1 else 's'} for KLIP only"
-    steps.append(f"products{only if unused else ''}")
-    return "\n".join(f"{number}. {step}" for number, step in enumerate(steps, 1))
 
 
 def _require_flux_and_spectra(
@@ -333,26 +275,7 @@ def run(config: Path, output: Path, scheduler: str | None = None, *, progress: b
     failed = table[table["status"] == "failed"]
     counts = {status: int((table["status"] == status).sum()) for status in ("finished", "failed")}
     click.echo(f"{counts['finished']} of {len(table)} jobs finished, {counts['failed']} failed")
-    # The candidates of a job with an injected planet include that planet.
-    real = (table["status"] == "finished") & table["injected_contrast"].mask
-    for row in table[real & ~table["snr"].mask]:
-        click.echo(
-            f"  {row['name']}: S/N {row['snr']:.1f} at {row['separation_arcsec']:.3f} arcsec, "
-            f"contrast {row['contrast']:.2e} +- {row['contrast_error']:.1e}"
-        )
-    for star in table.meta["combined"]:
-        if "reason" in star:
-            click.echo(f"  {star['star']}: no combined search: {star['reason']}")
-            continue
-        for each in star["candidates"]:
-            verdict = f", {each['verdict']}" if "verdict" in each else ""
-            click.echo(
-                f"  {star['star']}, all filters and epochs: S/N {each['snr']:.1f} at "
-                f"{each['separation_arcsec']:.3f} arcsec ({each['spectrum']}){verdict}"
-            )
     for row in failed:
         click.echo(f"  {row['name']} failed: {row['message']}")
-    for name in ("results.ecsv", "results.parquet", "survey.html"):
-        if (output / name).exists():
-            click.echo(f"wrote {output / name}")
+    click.echo(f"wrote {output / 'results.ecsv'} and {output / 'survey.html'}")
     return 1 if len(failed) else 0

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from pyklip_diffrender.errors import ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.options import OPTIONS, ReduceOptions
@@ -24,7 +23,7 @@ from pyklip_diffrender.options import OPTIONS, ReduceOptions
 if TYPE_CHECKING:
     from pyklip_diffrender.io.files import OutputFolder
 
-# Memory of this process, and what the machine has left.
+# Memory of this process.
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Parameters of glibc's ``mallopt``, from its header ``malloc.h``."""
@@ -67,20 +66,6 @@ def importing() -> Iterator[None]:
         gc.enable()
 
 
-def free_memory() -> float | None:
-    """Bytes of memory that a new process could use; None where the system does not say."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        kilobytes = next(line for line in lines if line.startswith("MemAvailable")).split()[1]
-        return 1024.0 * int(kilobytes)
-    except (OSError, StopIteration):
-        pass
-    try:
-        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, OSError, ValueError):
-        return None
-
-
 # Parts of all commands: messages and the log, outputs that may be written, the device.
 
 PROGRAM = "pyklip-diffrender"
@@ -104,35 +89,6 @@ class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
         return f"{PROGRAM}: {warning}{message}"
 
 
-def _takes_text(stream: Any) -> bool:
-    """Whether a standard stream exists and is open: under ``pythonw`` there is none."""
-    if stream is None or stream.closed:
-        return False
-    try:
-        stream.flush()
-    except (OSError, ValueError):
-        return False
-    return True
-
-
-@contextmanager
-def open_streams() -> Iterator[None]:
-    """Put an empty file in place of standard streams that are missing or closed."""
-    # Without them, as under ``pythonw``, in a job of a scheduler or after ``2>&-``, the first
-    # message or progress bar would end the program.
-    before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
-    with open(os.devnull, "w", encoding="utf-8") as nowhere:
-        try:
-            for name, stream in before.items():
-                if not _takes_text(stream):
-                    setattr(sys, name, nowhere)
-            yield
-        finally:
-            for name, stream in before.items():
-                if getattr(sys, name) is nowhere:
-                    setattr(sys, name, stream)
-
-
 _LEAST_ROOM_BYTES = 1e8
 """Room for the products of two rolls of 80 x 80 pixels, which take 30 MB, and of more frames."""
 
@@ -145,8 +101,6 @@ class Run:
     progress: bool = False
     # Device of PyTorch.
     device: str = ReduceOptions.device
-    _output: Path | None = None
-    _before: dict[Path, int] = field(default_factory=dict)
     _handlers: list[logging.Handler] = field(default_factory=list)
 
     @contextmanager
@@ -171,9 +125,7 @@ class Run:
                 logging.getLogger().removeHandler(handler)
                 handler.close()
 
-    def configure(
-        self, *, verbose: bool, quiet: bool, log_file: Path | None, device: str, threads: int | None
-    ) -> None:
+    def configure(self, *, verbose: bool, quiet: bool, device: str, threads: int | None) -> None:
         """Take what the options of all commands say."""
         on_terminal = _OnTerminal()
         # Away from a terminal a bar is noise: the stages and a line a minute take its place.
@@ -186,16 +138,9 @@ class Run:
                 record.levelno >= threshold or (stages and record.name.endswith(".progress"))
             )
         )
-        self._add(on_terminal)
+        logging.getLogger().addHandler(on_terminal)
+        self._handlers.append(on_terminal)
         logging.getLogger("pyklip_diffrender").setLevel(logging.DEBUG if verbose else logging.INFO)
-        if log_file is not None:
-            try:
-                log_file.parent.mkdir(parents=True, exist_ok=True)
-                to_file = logging.FileHandler(log_file, encoding="utf-8")
-            except OSError as error:
-                raise IncompatibleSetupError(f"--log-file: {error}") from error
-            to_file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-            self._add(to_file)
         self.device = device
         if device != "cpu":
             _require_device(device)
@@ -204,52 +149,40 @@ class Run:
 
             torch.set_num_threads(threads)
 
-    def _add(self, handler: logging.Handler) -> None:
-        logging.getLogger().addHandler(handler)
-        self._handlers.append(handler)
 
-    def claim_folder(self, folder: Path, products: tuple[str, ...]) -> None:
-        """Raise IncompatibleSetupError if products cannot be written."""
-        _require_no_broken_link(folder, "--output")
-        for name in products:
-            _require_no_broken_link(folder / name, "--output")
-        self._claim(folder, _existing(folder))
+def claim_folder(folder: Path, products: tuple[str, ...]) -> None:
+    """Raise IncompatibleSetupError if products cannot be written."""
+    _require_no_broken_link(folder, "--output")
+    for name in products:
+        _require_no_broken_link(folder / name, "--output")
+    _require_room(folder, _existing(folder))
 
-    def claim_file(self, path: Path) -> None:
-        """Raise IncompatibleSetupError if a file cannot be written."""
-        _require_no_broken_link(path, "OUTPUT")
-        if not path.absolute().parent.is_dir():
-            raise IncompatibleSetupError(
-                f"--output: there is no folder {path.parent} to write into"
-            )
-        if path.is_dir():
-            raise IncompatibleSetupError(f"--output: {path} is a folder, expected a file")
-        self._claim(path, path.absolute().parent)
 
-    def _claim(self, output: Path, folder: Path) -> None:
-        if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
-            raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
-        disk = shutil.disk_usage(folder)
-        if not disk.total:
-            raise IncompatibleSetupError(
-                f"{output} cannot be written: {folder} is of the system, and takes no files. "
-                "Choose another place"
-            )
-        if disk.free < _LEAST_ROOM_BYTES:
-            raise IncompatibleSetupError(
-                f"{output}: got {disk.free / 1e6:.0f} MB of room on the disk, expected at least "
-                f"{_LEAST_ROOM_BYTES / 1e6:.0f} MB. Make room, or choose another place"
-            )
-        self._output, self._before = output, _files(output)
+def claim_file(path: Path) -> None:
+    """Raise IncompatibleSetupError if a file cannot be written."""
+    _require_no_broken_link(path, "OUTPUT")
+    if not path.absolute().parent.is_dir():
+        raise IncompatibleSetupError(f"--output: there is no folder {path.parent} to write into")
+    if path.is_dir():
+        raise IncompatibleSetupError(f"--output: {path} is a folder, expected a file")
+    _require_room(path, path.absolute().parent)
 
-    def left(self) -> str:
-        """Files that an interrupted run has left, as a sentence."""
-        output = self._output
-        written = [] if output is None else _files(output).items() - self._before.items()
-        if not written:
-            return "nothing was written"
-        names = sorted(path.name for path, _ in written)
-        return f"these files in {output} are new and complete: {', '.join(names)}"
+
+def _require_room(output: Path, folder: Path) -> None:
+    """Raise IncompatibleSetupError if an output cannot be written to a folder, or has no room."""
+    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+        raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
+    disk = shutil.disk_usage(folder)
+    if not disk.total:
+        raise IncompatibleSetupError(
+            f"{output} cannot be written: {folder} is of the system, and takes no files. "
+            "Choose another place"
+        )
+    if disk.free < _LEAST_ROOM_BYTES:
+        raise IncompatibleSetupError(
+            f"{output}: got {disk.free / 1e6:.0f} MB of room on the disk, expected at least "
+            f"{_LEAST_ROOM_BYTES / 1e6:.0f} MB. Make room, or choose another place"
+        )
 
 
 def named_files(folder: Path, names: tuple[str, ...], overwrite: bool) -> OutputFolder:
@@ -287,16 +220,6 @@ def _require_no_broken_link(path: Path, option: str) -> None:
 def _existing(folder: Path) -> Path:
     """The folder, or the nearest one above it that exists."""
     return next(path for path in (folder, *folder.absolute().parents) if path.exists())
-
-
-def _files(output: Path) -> dict[Path, int]:
-    """Files and the times at which they were written; temporary ones have a dot."""
-    inside = output.iterdir() if output.is_dir() else [output]
-    return {
-        path: path.stat().st_mtime_ns
-        for path in inside
-        if path.is_file() and not path.name.startswith(".")
-    }
 
 
 def _require_device(name: str) -> None:
@@ -378,7 +301,7 @@ class _Wavefront(click.types.StringParamType):
 
 
 class Command(click.Command):
-    """A command with help by section, whose general options may also stand before it."""
+    """A command with the general options, and with help by section."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of the options."""
@@ -396,24 +319,17 @@ class Command(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Apply the general options, then run the command with its own."""
-        if ctx.parent is not None:
-            for name in COMMON:
-                before, own = (c.get_parameter_source(name) for c in (ctx.parent, ctx))
-                if before is ParameterSource.COMMANDLINE and own is not before:
-                    ctx.params[name] = ctx.parent.params[name]
         general = {name: ctx.params.pop(name) for name in COMMON}
         ctx.ensure_object(Run).configure(**general)
         return super().invoke(ctx)
 
 
-COMMON = ("verbose", "quiet", "log_file", "device", "threads")
-"""Options that may stand before the command and after it."""
+COMMON = ("verbose", "quiet", "device", "threads")
+"""Options of all commands."""
 
 common = _all(
     option("-v", "--verbose", is_flag=True, section=_GENERAL, help="Log every step of a fit."),
     option("-q", "--quiet", is_flag=True, section=_GENERAL, help="Show no progress."),
-    option("--log-file", type=file_type(), metavar="FILE", section=_GENERAL,
-           help="Append the messages to this file, with their times."),
     declared("device"),
     option("--threads", type=click.IntRange(min=1), metavar="N", section=_GENERAL,
            help="Number of threads; default: PyTorch's choice."),
@@ -477,15 +393,10 @@ search = _all(
                 "FITS or VOTable with units; without any they are micron and Jy. "
                 'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
     option("--dry-run", is_flag=True, section="Output",
-           help="Make all checks, show frames, OPD map and steps, and stop."),
+           help="Make all checks, show frames and OPD map, and stop."),
     option("--derivatives", is_flag=True, section="Output",
            help="Keep the fit's derivatives in fit.fits, which then takes ten times the space: "
            "they are needed to search the fit again."),
-    option("--figures", type=click.Choice(("pdf", "png", "svg")), section="Output",
-           help="Write every figure of the report to a file of this format, too, in the folder "
-           "figures."),
-    option("--json", is_flag=True, section="Output",
-           help="Print the content of summary.json and nothing else on standard output."),
 )  # fmt: skip
 
 together = _all(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.association import Hypotheses, Motion
@@ -29,7 +28,6 @@ from pyklip_diffrender.instrument.spectrum import PlanetSpectra
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.tables import Column, add_columns, plain_rows
-from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement.fit_file import text_hdu
 
 COMBINED = {
@@ -114,7 +112,7 @@ class Combination:
 
     >>> import pyklip_diffrender as dr
     >>> both = dr.combine(["products/F356W", "products/F444W"])  # doctest: +SKIP
-    >>> both.measure([[0.41, -0.35]])["contrast_F356W", "snr_F356W"]  # doctest: +SKIP
+    >>> both.candidates["contrast_F356W", "snr_F356W"]  # doctest: +SKIP
     """
 
     target: str
@@ -145,41 +143,6 @@ class Combination:
     def dates(self) -> list[float]:
         """Mean date of each epoch, MJD, in order of time."""
         return [date_of(each) for each in epochs_of(self.maps)]
-
-    def measure(self, places: ArrayLike) -> QTable:
-        """Fluxes of unmoved sources at places, with every spectrum; nothing is searched.
-
-        Parameters
-        ----------
-        places : (k, 2)
-            East and north of the star, arcsec.
-
-        Returns
-        -------
-        QTable
-            A row for each place: for each spectrum its amplitude (the flux, in units of `unit`, in
-            the filter where the spectrum is highest), error and S/N, (k, spectra); and for each
-            filter the contrast, its error and S/N.
-        """
-        points = np.atleast_2d(np.asarray(to_arcsec(places, "places"), dtype=float))
-        stack = SkyStack.of(
-            self.maps, self.spectra.filters, self._scales, points, unmoved(self.maps)
-        )
-        weights = stack.weights(self.spectra.flux)
-        snr = np.einsum("kfn,fn->kn", weights, stack.snr).T
-        error = stack.amplitude_errors(self.spectra.flux).T
-        table = QTable({"east": points[:, 0] * u.arcsec, "north": points[:, 1] * u.arcsec})
-        table["amplitude"], table["amplitude_error"], table["snr"] = snr * error, error, snr
-        for k, name in enumerate(self.spectra.filters):
-            star = star_of_filter(self.maps, name, self._scales)
-            table[f"contrast_{name}"] = stack.flux[k] / star
-            table[f"contrast_error_{name}"] = stack.error[k] / star
-            table[f"snr_{name}"] = stack.snr[k]
-        return table
-
-    @cached_property
-    def _scales(self) -> dict[str, float]:
-        return scales_of(self.maps, self.unit)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the search as plain values for JSON; names end in the unit of their values."""

@@ -197,18 +197,9 @@ class ErrorFactor:
         return bool(np.isfinite(self.freedom).any())
 
     @property
-    def is_needed(self) -> bool:
-        """Whether any errors are multiplied by more than 1."""
-        return bool(self.factors.max() > 1)
-
-    @property
     def typical(self) -> float:
         """Median over the field."""
         return float(np.median(self.factors))
-
-    def at_least(self, factor: float) -> ErrorFactor:
-        """The larger of both everywhere."""
-        return replace(self, factors=np.maximum(self.factors, factor))
 
 
 def _inverse(values: Image) -> Image:
@@ -387,8 +378,9 @@ class Significance:
         """Factor for the errors of a map with sources at x, y, (k, 2), arcsec."""
         if not self.measured:
             return ErrorFactor.constant(self.least)
-        factor = self._scatter.factor(snr, sources).at_least(self.least)
-        return replace(factor, factors=np.hypot(factor.factors, self.structures))
+        factor = self._scatter.factor(snr, sources)
+        factors = np.hypot(np.maximum(factor.factors, self.least), self.structures)
+        return replace(factor, factors=factors)
 
     @cached_property
     def _scatter(self) -> Scatter:

@@ -21,7 +21,6 @@ from scipy.ndimage import label, map_coordinates
 from scipy.optimize import least_squares
 from scipy.sparse.csgraph import connected_components
 
-from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates, with_position_of_star
 from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance, contrast_table
@@ -32,7 +31,7 @@ from pyklip_diffrender.detection.field import (
     separation_of,
 )
 from pyklip_diffrender.detection.measurement import candidate_table, in_words
-from pyklip_diffrender.detection.search_result import Detection, draw_curve
+from pyklip_diffrender.detection.search_result import Detection, draw_search
 from pyklip_diffrender.detection.whole_frame import EDGE, REACH, WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
@@ -108,11 +107,6 @@ class WideField:
         """The first frame, as far as it was fitted."""
         return self.detection.observation
 
-    @property
-    def north(self) -> float:
-        """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
-        return self.detection.north
-
     def subtracted(
         self, whole: Sequence[Observation], cut: Sequence[Observation]
     ) -> tuple[Observation, ...] | None:
@@ -154,18 +148,7 @@ class WideField:
         -------
         ndarray of Axes, (2,)
         """
-        axes = drawing.axes_for(ax, 2)
-        table = self.candidates
-        count = len(table)
-        drawing.snr_map(
-            axes[0], self.snr, self.grid,
-            np.stack([table["x"].value, table["y"].value], axis=1),
-            self.observation.north,
-            title=f"{count} candidate{'' if count == 1 else 's'} above S/N {self.threshold:g}",
-            labels=[str(k) for k in range(1, count + 1)],
-        )  # fmt: skip
-        draw_curve(axes[1], self)
-        return np.array(axes)
+        return draw_search(ax, self, [str(k) for k in range(1, len(self.candidates) + 1)])
 
     def write(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> list[Path]:
         """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables.
@@ -299,9 +282,7 @@ class _Source:
         return np.asarray(squared < _COVERED_SIGMAS**2)
 
 
-def wide_field(
-    detection: Detection, observations: Sequence[Observation], *, threshold: float | None = None
-) -> WideField:
+def wide_field(detection: Detection, observations: Sequence[Observation]) -> WideField:
     """Search whole frames for point sources, at most in the field of the mask, 20 arcsec wide.
 
     Parameters
@@ -310,8 +291,6 @@ def wide_field(
         Search of one fit, whose frames are cutouts of the observations.
     observations : sequence of Observation
         The target's frames before they were cut, in the order of the fit.
-    threshold : float, optional
-        Smallest S/N of a candidate; default: the detection's.
 
     Returns
     -------
@@ -331,7 +310,7 @@ def wide_field(
     >>> fit = dr.refine(dr.model_for(frame, 80), frame.cutout(80), "opd.fits")  # doctest: +SKIP
     >>> wide = dr.detection.wide_field(dr.detect(fit), [frame])  # doctest: +SKIP
     """
-    threshold = detection.threshold if threshold is None else threshold
+    threshold = detection.threshold
     frames = _frames(detection, observations)
     grid = frames[0].grid
     window = _window(detection, frames[0])

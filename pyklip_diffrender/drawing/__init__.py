@@ -30,7 +30,7 @@ from pyklip_diffrender.drawing.images import (
     snr_map,
     star_image,
 )
-from pyklip_diffrender.drawing.measurements import Epoch, Stamp, corner, sky_track, stamp_panels
+from pyklip_diffrender.drawing.measurements import Epoch, Stamp, sky_track, stamp_panels
 
 __all__ = [
     "SNR_LINEAR",
@@ -39,7 +39,6 @@ __all__ = [
     "axes_for",
     "completeness",
     "contrast_curve",
-    "corner",
     "halo",
     "injected_planets",
     "light_norm",

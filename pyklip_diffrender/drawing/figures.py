@@ -138,16 +138,8 @@ def wide_panel() -> tuple[Figure, Axes]:
 
 def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
     """Write a figure in one step, in the format that the ending of the path names."""
-    from matplotlib import rc_context
-
-    form = Path(path).suffix.removeprefix(".").lower()
-    # The same figure makes the same file; journals ask for fonts that are no outlines.
-    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
-    style = rc_context(
-        {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pyklip_diffrender"}
-    )
-    with replacing(path) as temporary, style:
-        figure.savefig(temporary, dpi=dpi, facecolor="white", format=form, metadata=undated)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, facecolor="white", format=Path(path).suffix[1:])
 
 
 def to_png(figure: Figure, dpi: int = 150) -> bytes:

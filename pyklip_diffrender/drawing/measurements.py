@@ -1,4 +1,4 @@
-"""A measured source: its pixels, its flux and position, and its way over the sky."""
+"""A measured source: its pixels, and its way over the sky."""
 
 from __future__ import annotations
 
@@ -18,14 +18,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_STAMPS_INCHES, _CORNER_INCHES = (4.8, 3.9), (4.8, 4.4)
-"""Sizes of figures of several small axes, inches."""
-
-_ELLIPSE_SIGMAS = (1.0, 2.0)
-"""Ellipses of a corner figure, standard deviations."""
-
-_POINTS_PER_CURVE = 181
-"""Points of a curve."""
+_STAMPS_INCHES = (4.8, 3.9)
+"""Size of a figure of four small axes, inches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,60 +63,6 @@ def stamp_panels(stamp: Stamp, unit: str) -> Figure:
         ax.plot(*middle, "+", color=INK, ms=8, path_effects=halo())
         label_sky(ax, stamp.north is not None, fontsize="small")
         ax.label_outer()
-    return figure
-
-
-def corner(names: Sequence[str], values: Array, covariance: Array, labels: Sequence[str]) -> Figure:
-    """Draw the Gaussian of a few measured values: marginal distributions, and ellipses of pairs.
-
-    `names` (n) label the axes, with units, `values` is (n,), `covariance` (n, n), and
-    `labels` (n) are values with their errors, as titles. Ellipses have one and two standard
-    deviations: 39 and 86 % of the probability.
-    """
-    from matplotlib.figure import Figure
-
-    count = len(names)
-    figure = Figure(figsize=_CORNER_INCHES, layout="constrained")
-    axes: NDArray[Any] = figure.subplots(count, count, sharex="col", squeeze=False)
-    errors = np.sqrt(np.diagonal(covariance))
-    turn = np.linspace(0, 2 * np.pi, _POINTS_PER_CURVE)
-    for row, column in np.ndindex(count, count):
-        ax: Axes = axes.item(row, column)
-        if column > row:
-            ax.set_axis_off()
-            continue
-        if column == row:
-            steps = np.linspace(-3.5, 3.5, _POINTS_PER_CURVE)
-            bell = np.exp(-(steps**2) / 2)
-            ax.fill_between(values[row] + errors[row] * steps, bell, color=ACCENT, alpha=0.15, lw=0)
-            ax.plot(values[row] + errors[row] * steps, bell, color=ACCENT)
-            ax.set_title(labels[row], fontsize="small")
-            ax.set_yticks([])
-            ax.set_ylim(0, 1.1)
-        else:
-            pair = [column, row]
-            # With a covariance L L^T, the ellipse of one standard deviation is L times the unit
-            # circle.
-            root = np.linalg.cholesky(covariance[np.ix_(pair, pair)])
-            circle = root @ np.stack([np.cos(turn), np.sin(turn)])
-            for sigmas in _ELLIPSE_SIGMAS:
-                x, y = values[pair][:, None] + sigmas * circle
-                ax.plot(x, y, color=ACCENT)
-                ax.fill(x, y, color=ACCENT, alpha=0.12, lw=0)
-            ax.plot(*values[pair], "+", color=INK)
-            ax.set_ylim(*(values[row] + np.array([-3.5, 3.5]) * errors[row]))
-        ax.set_xlim(*(values[column] + np.array([-3.5, 3.5]) * errors[column]))
-        ax.tick_params(labelsize="small")
-        ax.tick_params(axis="x", rotation=45)
-        ax.locator_params(axis="x", nbins=4)
-        if 0 < column < row:
-            ax.set_yticks([])
-        elif column < row:
-            ax.locator_params(axis="y", nbins=4)
-        if row == count - 1:
-            ax.set_xlabel(names[column], fontsize="small")
-        if column == 0 and row:
-            ax.set_ylabel(names[row], fontsize="small")
     return figure
 
 

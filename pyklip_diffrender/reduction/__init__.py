@@ -7,7 +7,6 @@ from pyklip_diffrender.reduction.products import (
     ProductFolder,
     existing_products,
     write_products,
-    write_report,
 )
 from pyklip_diffrender.reduction.reduction import Reduction, reduce
 from pyklip_diffrender.reduction.several import (
@@ -43,5 +42,4 @@ __all__ = [
     "summarise",
     "write_comparison",
     "write_products",
-    "write_report",
 ]

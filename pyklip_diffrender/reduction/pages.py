@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import groupby
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -218,15 +217,11 @@ def _span(values: Sequence[float], form: str) -> str:
 
 # Pages of HTML that need no other file: their templates, pictures and numbers.
 
-FIGURE_FORMATS = ("pdf", "png", "svg")
-"""Formats in which the figures of a page can be written as files of their own."""
-
 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """A figure of a page and its caption."""
 
-    name: str  # of its file, without the ending
     figure: Any  # of matplotlib
     caption: str  # the first sentence also describes the picture to readers who do not see it
 
@@ -239,16 +234,6 @@ class Picture:
 def render(template: str, **values: Any) -> str:
     """Make a page of a template; all values are escaped: headers of files may hold anything."""
     return _environment().get_template(template).render(values)
-
-
-def write_figures(pictures: Iterable[Picture], folder: Path, form: str) -> list[Path]:
-    """Write every figure to a file of its own in one of `FIGURE_FORMATS`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for each in pictures:
-        paths.append(folder / f"{each.name}.{form}")
-        drawing.save(each.figure, paths[-1])
-    return paths
 
 
 def count(number: int, noun: str) -> str:

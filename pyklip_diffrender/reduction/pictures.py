@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +29,7 @@ from pyklip_diffrender.imaging import SkyModel
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.units import rotation_matrix
-from pyklip_diffrender.reduction.pages import Picture, number, plus_minus
+from pyklip_diffrender.reduction.pages import Picture, number
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.scene.observation import Window
@@ -236,25 +236,6 @@ class Overview:
         ax.set_xlim((-half, half) if north is None else (half, -half))
         ax.set_ylim(-half, half)
 
-    def kept(self, separations: Sequence[float]) -> tuple[Image, Image | None]:
-        """Fractions of a faint source's light that the image and KLIP leave at separations.
-
-        Medians of rings a resolution element wide; KLIP's are for its best numbers of modes.
-        """
-        resolution = self._detection.contrast_curve.meta["resolution_arcsec"]
-        distance = np.hypot(*np.moveaxis(self.images.grid, -1, 0))
-        kept = self.images.throughput
-        ours = [
-            np.nanmedian(kept[np.abs(distance - each) < resolution / 2]) for each in separations
-        ]
-        if self.klip is None:
-            return np.array(ours), None
-        curve = self.klip.curve
-        theirs = np.interp(
-            separations, curve["separation"].value, curve["throughput"], np.nan, np.nan
-        )
-        return np.array(ours), np.asarray(theirs)
-
     def figure(self) -> Any:
         """One figure of the panels but the most probable image, and the contrast curve."""
         panels = [each for each in self.panels if each != "most_probable"]
@@ -313,11 +294,6 @@ class ReportPictures:
             _wavefront(reduction, summary),
         )
 
-    def __iter__(self) -> Iterator[Picture]:
-        for each in (self.overview, self.curve, *self.candidates, self.wide, self.disk,
-                     self.injections, self.completeness, *self.stars, self.wavefront):  # fmt: skip
-            yield from each
-
 
 def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     """The frames without the star, KLIP's beside them, and the S/N map; north is up."""
@@ -325,19 +301,12 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'}"
     some += f" above S/N {summary['threshold_snr']:g}"
     up = "north up" if summary["oriented"] else "oriented like the first frame"
-    separations = [row["separation_arcsec"] for row in summary["limits"]]
-    ours, theirs = overview.kept(separations)
-    fitted = (
-        "A candidate, which was fitted together with the star, keeps all of its light. "
-        "Circles mark the candidates. "
-        if count
-        else ""
-    )
     words = {
         "without_star": (
-            f"Mean of all frames minus the star, {up}. "
-            f"{_kept('A faint source keeps', ours, separations, ' (THROUGHPUT in images.fits)')}"
-            f"{fitted}The scale is linear near 0 and logarithmic beyond."
+            f"Mean of all frames minus the star, {up}. THROUGHPUT in images.fits is the part of "
+            "the light of a faint source that is left; circles mark candidates, which were fitted "
+            "together with the star and keep all of their light. The scale is linear near 0 and "
+            "logarithmic beyond."
         ),
         "most_probable": (
             f"Most probable image of the sky without star and detector, {up}, from all frames and "
@@ -346,28 +315,12 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
         ),
         "snr": f"S/N of a point source at every pixel, {some}. The scale is linear within ±5.",
     }
-    if overview.klip is not None and theirs is not None:
-        words["klip"] = (
-            f"Mean of the same frames after {overview.klip.label}, on the same scale. "
-            f"{_kept('Any source, a candidate too, keeps about', theirs, separations)}"
-        ).rstrip()
+    if overview.klip is not None:
+        words["klip"] = f"Mean of the same frames after {overview.klip.label}, on the same scale."
     figures, axes = _panels(len(overview.panels))
     for ax, panel in zip(axes, overview.panels, strict=True):
         overview.draw(ax, panel)
-    return _pictures(figures, {each: words[each] for each in overview.panels})
-
-
-def _kept(
-    subject: str, fractions: NDArray[np.float64], separations: Sequence[float], source: str = ""
-) -> str:
-    """A sentence about the light that is kept; empty where none is known."""
-    parts = [
-        f"{100 * fraction:.0f} % of its light at {separation:.3g} arcsec"
-        for fraction, separation in zip(fractions, separations, strict=True)
-        if np.isfinite(fraction)
-    ]
-    first, others = parts[:1], [each.replace(" of its light", "") for each in parts[1:]]
-    return f"{subject} {', '.join([*first, *others])}{source}. " if parts else ""
+    return _pictures(figures, [words[each] for each in overview.panels])
 
 
 def _curve(
@@ -393,44 +346,24 @@ def _curve(
     caption = (
         f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}, against "
         "separation: the median of all position angles and their range. "
-        f"Dashed: the limit for an exactly known star.{beside}{dotted} {_scaled(detection)}"
+        f"Dashed: the limit for an exactly known star.{beside}{dotted}"
     )
-    return [Picture("contrast_curve", figure, caption)]
+    return [Picture(figure, caption)]
 
 
 def _candidate(detection: Detection, place: int) -> list[Picture]:
-    """Pixels in every frame, flux and position of a candidate, by its place in the table."""
+    """Pixels of a candidate in every frame, by its place in the table."""
     number = place + 1
     unit = drawing.unit_label(detection.observation.unit)
-    stamps = _stamps(detection, place)
-    pictures = [
+    return [
         Picture(
-            f"candidate_{number}_frame_{frame}",
             drawing.stamp_panels(stamp, unit),
             f"Candidate {number} in frame {frame}{_roll(stamp.north)}: the data; without star, "
             "background and other candidates; the model of the source, on the same scale; and what "
             "is left, in standard deviations of the noise. The cross marks the fitted position.",
         )
-        for frame, stamp in stamps.items()
+        for frame, stamp in _stamps(detection, place).items()
     ]
-    names, values, covariance = _measured(detection, place)
-    power = int(np.floor(np.log10(values[0])))
-    scale = np.array([10.0**-power, 1e3, 1e3])
-    values, covariance = scale * values, np.outer(scale, scale) * covariance
-    errors = np.sqrt(np.diagonal(covariance))
-    titles = [plus_minus(value, error) for value, error in zip(values, errors, strict=True)]
-    figure = drawing.corner(
-        [rf"contrast ($10^{{{power}}}$)", *(f"{each} (mas)" for each in names)],
-        values, covariance, titles,
-    )  # fmt: skip
-    corner = Picture(
-        f"candidate_{number}_corner",
-        figure,
-        f"Contrast and position of candidate {number} by the covariance of the fit, with the star "
-        "and the other candidates marginalised. Ellipses have one and two standard deviations, 39 "
-        "and 86 % of the probability. Errors include the star's flux and position.",
-    )
-    return [*pictures, corner]
 
 
 def _roll(north: float | None) -> str:
@@ -482,44 +415,6 @@ def _stamps(detection: Detection, place: int) -> dict[int, drawing.Stamp]:
     return stamps
 
 
-def _measured(
-    detection: Detection, place: int
-) -> tuple[tuple[str, str], NDArray[np.float64], NDArray[np.float64]]:
-    """Contrast and offset (3,) of a candidate, arcsec, with their names and covariance (3, 3).
-
-    The offset is to the east and north where the orientation is known, else x and y.
-    """
-    row = detection.candidates[place]
-    is_known = "delta_ra" in row.colnames
-    offset = ("delta_ra", "delta_dec") if is_known else ("x", "y")
-    short = ("ra", "dec") if is_known else ("x", "y")
-    values = np.array([row["contrast"], *(row[each].value for each in offset)])
-    errors = np.array([row["contrast_error"], *(row[f"{each}_error"].value for each in offset)])
-    upper = np.zeros((3, 3))
-    upper[np.triu_indices(3, 1)] = [
-        *(row[f"contrast_{each}_corr"] for each in short), row[f"{''.join(short)}_corr"]
-    ]  # fmt: skip
-    covariance = np.outer(errors, errors) * (np.eye(3) + upper + upper.T)
-    return (("ΔRA cos Dec", "ΔDec") if is_known else offset), values, covariance
-
-
-def _scaled(detection: Detection) -> str:
-    """How errors were scaled, in a sentence."""
-    factors = detection.error_factor.factors
-    if not detection.error_factor.is_needed:
-        return "Errors are as in the fit, not scaled."
-    if not detection.error_factor.is_measured:
-        return (
-            f"Errors were multiplied by {factors[0, 0]:.2f}, the square root of the reduced "
-            "chi-squared without the candidates."
-        )
-    return (
-        f"Errors were multiplied by {factors.min():.2f} to {factors.max():.2f}, depending on "
-        "the star's light and the separation, so that the S/N away from candidates has a "
-        "standard deviation of 1."
-    )
-
-
 def _wide(wide: WideField) -> list[Picture]:
     """The S/N map of the whole frames, and the contrast curve to their edge."""
     figures, axes = _panels(2)
@@ -529,18 +424,16 @@ def _wide(wide: WideField) -> list[Picture]:
     oriented = wide.observation.position_angles is not None
     up = "north up" if oriented else "oriented like the first frame"
     ny, nx = wide.snr.shape
-    words = {
-        "whole_frames_snr": (
+    words = [
+        (
             f"S/N of a point source in the whole frames, {some}, {up}: {nx} × {ny} pixels, at most "
             "the field of the mask, 20 arcsec wide. Circles have the numbers of the table. About "
             "the star it is the S/N of the search above; elsewhere the star, extrapolated from its "
             "fit, and the background were subtracted. Errors follow the scatter of the S/N at "
             "every separation."
         ),
-        "whole_frames_contrast_curve": (
-            "Contrast limit to the edge of the frames, as far as half of a ring is in them."
-        ),
-    }
+        "Contrast limit to the edge of the frames, as far as half of a ring is in them.",
+    ]
     return _pictures(figures, words)
 
 
@@ -548,17 +441,17 @@ def _disk(disk: Disk) -> list[Picture]:
     """The frames without the star, and the extended light that was fitted."""
     figures, axes = _panels(2)
     disk.plot(axes)
-    words = {
-        "extended_light": (
+    words = [
+        (
             "Frames minus the star, turned to the orientation of the first one and averaged. The "
             "star was fitted together with the extended light, which therefore is not subtracted "
             "with it."
         ),
-        "extended_light_model": (
+        (
             "Light of the non-negative sources that were fitted together with the star, as the "
             "coronagraph shows it in the first frame."
         ),
-    }
+    ]
     return _pictures(figures, words)
 
 
@@ -570,7 +463,7 @@ def _injections(planets: QTable) -> list[Picture]:
         f"Recovered over injected contrast of {len(planets)} planets against separation. Filled: "
         "detected. Open: not detected, and measured at the known place."
     )
-    return [Picture("injected_planets", figure, caption)]
+    return [Picture(figure, caption)]
 
 
 def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
@@ -582,7 +475,7 @@ def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
         "Fraction of planets that the search finds, by contrast and separation. Dashed: 50 %; "
         "solid: 95 %; dotted: the contrast curve at 5 sigma."
     )
-    return [Picture("completeness", figure, caption)]
+    return [Picture(figure, caption)]
 
 
 def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
@@ -597,19 +490,18 @@ def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
     )
     mean = f", the mean of {count} integrations" if count > 1 else ""
     mean += "" if reduction.disk is None else ", without the extended light"
-    words = {
-        "data": (
+    words = [
+        (
             f"Image of {observation.target} behind the coronagraph{mean}, in {unit}. The scale is "
             "linear near 0 and logarithmic in bright parts; the cross marks the star."
         ),
-        "model": "The fitted star and background, on the same scale.",
-        "residual": (
+        "The fitted star and background, on the same scale.",
+        (
             "Data without the star, over the noise of each pixel. The scale is linear within ±5."
             f"{subtracted}"
         ),
-    }
-    named = {f"frame_{frame + 1}_{name}": text for name, text in words.items()}
-    return _pictures(_of_frame(detection, frame), named)
+    ]
+    return _pictures(_of_frame(detection, frame), words)
 
 
 def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[Picture]:
@@ -623,17 +515,15 @@ def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[P
     drawing.opd_map(axes[0], before, width, title="Before the fit", limit=limit)
     drawing.opd_map(axes[1], after, width, title="After the fit", limit=limit)
     drawing.opd_map(axes[2], after - before, width, title="Change")
-    words = {
-        "wavefront_before": (
-            f"The OPD map that the fit started from ({about['name']}), {rms[0]} rms."
-        ),
-        "wavefront_after": f"The wavefront of the first frame after the fit, {rms[1]} rms.",
-        "wavefront_change": (
+    words = [
+        f"The OPD map that the fit started from ({about['name']}), {rms[0]} rms.",
+        f"The wavefront of the first frame after the fit, {rms[1]} rms.",
+        (
             f"Change of the wavefront, after minus before: {rms[2]} rms. The frames measure only "
             "what the Lyot stop lets through and what reaches the fitted pixels; the rest follows "
             "from the prior."
         ),
-    }
+    ]
     return _pictures(figures, words)
 
 
@@ -670,7 +560,6 @@ def _panels(count: int) -> tuple[list[Any], list[Any]]:
     return [figure for figure, _ in panels], [ax for _, ax in panels]
 
 
-def _pictures(figures: Sequence[Any], words: Mapping[str, str]) -> list[Picture]:
-    """Figures with the names of their files and their captions."""
-    pairs = zip(figures, words.items(), strict=True)
-    return [Picture(name, figure, caption) for figure, (name, caption) in pairs]
+def _pictures(figures: Sequence[Any], captions: Sequence[str]) -> list[Picture]:
+    """Figures with their captions."""
+    return [Picture(*each) for each in zip(figures, captions, strict=True)]

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.errors import CorruptFileError
 from pyklip_diffrender.io.files import OutputFolder, read_text, replacing, write_table
 from pyklip_diffrender.reduction.pages import (
-    FIGURE_FORMATS,
     count,
     depth_against_klip,
     number,
@@ -22,7 +20,6 @@ from pyklip_diffrender.reduction.pages import (
     remark_on_map,
     render,
     scientific,
-    write_figures,
 )
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.pipeline import ReductionResult
@@ -64,7 +61,6 @@ def page(
         map_remark=remark_on_map(summary["opd"]["days_before_first_frame"]),
         left_out=by_reason((each["name"], each["reason"]) for each in summary["left_out"]),
         provenance=_provenance(summary),
-        settings=list(_flat(summary["settings"])),
     )
 
 
@@ -180,28 +176,6 @@ def _provenance(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _flat(settings: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, str]]:
-    """Names and values of settings; settings in settings have both names."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{within}{name}.")
-        else:
-            yield f"{within}{name}", _setting(value)
-
-
-def _setting(value: Any) -> str:
-    """A value as one would write it in a table."""
-    if value is None:
-        return "default"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        return str(value)
-    return ", ".join(_setting(each) for each in value) or "none"
-
-
 _SMALL_CHI2 = 0.9
 """Reduced chi-squared below which errors are larger than the noise: of 1,600 pixels, which is the
 smallest number that is fitted as a rule, it has a standard deviation of 0.035."""
@@ -232,18 +206,6 @@ PRODUCTS = {
 """Every file that a reduction may write, with its content."""
 
 
-_FIGURES = "figures"
-"""Folder of the figures, in the folder of the products."""
-
-_FIGURE = re.compile(
-    r"(without_star|klip|most_probable|snr|contrast_curve|candidate_\d+_(frame_\d+|corner)"
-    r"|whole_frames_(snr|contrast_curve)|extended_light(_model)?|injected_planets|completeness"
-    r"|frame_\d+_(data|model|residual)|wavefront_(before|after|change))"
-    rf"\.({'|'.join(FIGURE_FORMATS)})"
-)
-"""Names of the files of figures."""
-
-
 def read_summary(folder: Path) -> dict[str, Any]:
     """Read ``summary.json`` of a folder; CorruptFileError if it is missing or damaged."""
     path = folder / "summary.json"
@@ -259,12 +221,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 def existing_products(folder: Path) -> list[Path]:
     """Files in a folder that are called like products of a reduction."""
-    figures = folder / _FIGURES
-    drawn = figures.iterdir() if figures.is_dir() else ()
-    return [
-        *(folder / name for name in PRODUCTS if (folder / name).exists()),
-        *sorted(path for path in drawn if _FIGURE.fullmatch(path.name)),
-    ]
+    return [folder / name for name in PRODUCTS if (folder / name).exists()]
 
 
 def write_products(
@@ -273,19 +230,12 @@ def write_products(
     *,
     fit: bool = True,
     derivatives: bool = False,
-    figures: Literal["pdf", "png", "svg"] | None = None,
 ) -> list[Path]:
     """Write the products of a reduction to a folder without any, and return their paths.
 
     The folder is made if it does not exist. `derivatives` says whether ``fit.fits`` has the
-    derivatives of the images. Raises IncompatibleSetupError for a format that is not one of
-    `FIGURE_FORMATS`.
+    derivatives of the images.
     """
-    if figures is not None and figures not in FIGURE_FORMATS:
-        raise IncompatibleSetupError(
-            f"figures: got {figures!r}, expected one of {', '.join(FIGURE_FORMATS)}, or None for a "
-            "report without files of its figures"
-        )
     written = reduction.detection.write(folder, overwrite=True)
     if fit:
         path = folder / "fit.fits"
@@ -308,18 +258,14 @@ def write_products(
     written.append(overview.images.write(folder / "images.fits"))
     written.append(folder / "detection.png")
     drawing.save(overview.figure(), written[-1])
-    summary, pictures = _shown(reduction, overview)
-    if figures is not None:
-        written += write_figures(pictures, folder / _FIGURES, figures)
-    written += _write_page(summary, pictures, folder, written)
-    return written
+    return written + write_report(reduction, overview, folder, written)
 
 
 class ProductFolder(OutputFolder):
     """A folder into which a reduction writes its products as its stages end.
 
-    `derivatives` and `figures` are as for `Reduction.write`. Raises ExistingFileError if there are
-    products in the folder, and `overwrite` is False.
+    `derivatives` is as for `Reduction.write`. Raises ExistingFileError if there are products in the
+    folder, and `overwrite` is False.
     """
 
     def __init__(
@@ -327,47 +273,29 @@ class ProductFolder(OutputFolder):
         folder: str | os.PathLike[str],
         *,
         derivatives: bool = False,
-        figures: Literal["pdf", "png", "svg"] | None = None,
         overwrite: bool = False,
     ) -> None:
         super().__init__(folder, existing_products, overwrite=overwrite)
-        self._derivatives, self._figures = derivatives, figures
+        self._derivatives = derivatives
 
     def keep(self, reduction: ReductionResult) -> list[Path]:
         """Write the products of a reduction, as far as it has come, and return their paths."""
         return self.replace(
-            lambda folder: write_products(
-                reduction, folder, derivatives=self._derivatives, figures=self._figures
-            )
+            lambda folder: write_products(reduction, folder, derivatives=self._derivatives)
         )
 
 
 def write_report(
-    reduction: ReductionResult, folder: Path, files: Iterable[Path] = ()
+    reduction: ReductionResult, overview: Overview, folder: Path, files: Iterable[Path] = ()
 ) -> list[Path]:
     """Write ``report.html``, one page that needs no other file, and ``summary.json``.
 
     Files of these names are replaced. The page lists `files`, other products.
     """
-    overview = Overview(SkyImages(reduction), Klip.of(reduction))
-    return _write_page(*_shown(reduction, overview), folder, files)
-
-
-def _shown(reduction: ReductionResult, overview: Overview) -> tuple[dict[str, Any], ReportPictures]:
-    """Numbers and pictures of the report."""
     summary = summarise(reduction, overview.klip and overview.klip.curve)
-    return summary, ReportPictures.of(reduction, overview, summary)
-
-
-def _write_page(
-    summary: dict[str, Any], pictures: ReportPictures, folder: Path, files: Iterable[Path]
-) -> list[Path]:
+    pictures = ReportPictures.of(reduction, overview, summary)
     html, data = (folder / name for name in ("report.html", "summary.json"))
-    listed = [*files, html, data]
-    drawn = [path for path in listed if path.parent.name == _FIGURES]
-    about = {path.name: PRODUCTS.get(path.name, "") for path in listed if path not in drawn}
-    if drawn:
-        about[f"{_FIGURES}/"] = f"the {len(drawn)} figures of this page, each in a file"
+    about = {path.name: PRODUCTS.get(path.name, "") for path in (*files, html, data)}
     text = page(summary, pictures, about)
     written = {html: text, data: json.dumps(summary, indent=2, allow_nan=False) + "\n"}
     for path, content in written.items():

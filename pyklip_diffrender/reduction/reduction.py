@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Unpack
+from typing import Any, Unpack
 
 from astropy.table import QTable
 from numpy.typing import NDArray
@@ -195,9 +195,8 @@ class Reduction(ReductionResult):
         *,
         overwrite: bool = False,
         derivatives: bool = False,
-        figures: Literal["pdf", "png", "svg"] | None = None,
     ) -> list[Path]:
-        """Write maps, tables, the fit, the detector pattern, figures and a report.
+        """Write maps, tables, the fit, the detector pattern, a figure and a report.
 
         Parameters
         ----------
@@ -209,9 +208,6 @@ class Reduction(ReductionResult):
             Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
             space: they are needed to search the fit again (`detect`), and to measure at other
             places (``Detection.read(...).measure``).
-        figures : {"pdf", "png", "svg"}, optional
-            Write every figure of the report to a file of this format in the folder ``figures``,
-            too. The report itself needs none of them.
 
         Returns
         -------
@@ -223,7 +219,7 @@ class Reduction(ReductionResult):
         ExistingFileError
             If there are products in the folder, and `overwrite` is False; it is also an `OSError`.
         IncompatibleSetupError
-            For another format of figures, and for a reduction that was read without derivatives.
+            For a reduction that was read without derivatives.
         """
         if not self.detection.groups:
             raise IncompatibleSetupError(
@@ -231,9 +227,7 @@ class Reduction(ReductionResult):
                 "derivatives of the images, which its figures need. Copy that folder, or write the "
                 "reduction with derivatives=True first"
             )
-        products = ProductFolder(
-            folder, derivatives=derivatives, figures=figures, overwrite=overwrite
-        )
+        products = ProductFolder(folder, derivatives=derivatives, overwrite=overwrite)
         return products.keep(self)
 
 

@@ -105,7 +105,6 @@ def _thumbnails(folders: Mapping[str, Mapping[str, Any]], above: Path) -> list[P
         some = f"{count or 'no'} candidate{'' if count == 1 else 's'}"
         pictures.append(
             Picture(
-                name,
                 figure,
                 f"{_name(summary)}: S/N of a point source, {some}, numbered as in the table.",
             )
@@ -125,7 +124,6 @@ def _combined_map(combination: Combination) -> Picture:
         labels=[str(k + 1) for k in range(len(table))],
     )  # fmt: skip
     return Picture(
-        "combined",
         figure,
         f"All reductions together: S/N of a point source that does not move, with the spectrum "
         f"{spectrum}, numbered as in the table of the combined search.",
@@ -165,7 +163,7 @@ def _limits(
             about = f"{about} All together: of a planet with the spectrum {name}."
     figure, ax = drawing.panel()
     drawing.survey_limits(ax, curves, [], sigmas)
-    return [Picture("limits", figure, about)]
+    return [Picture(figure, about)]
 
 
 def _known(separation: Any, contrast: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -206,7 +204,6 @@ def _tracks(combination: Combination) -> list[Picture]:
         drawing.sky_track(ax, drawn, start, f"Candidate {number}")
         pictures.append(
             Picture(
-                f"track_{number}",
                 figure,
                 f"Candidate {number} of the combined search, filled, and where a source in the "
                 "background would be at the other dates, open and connected by the dashed line. A "

@@ -28,7 +28,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from astropy.table import QTable
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtri
@@ -192,16 +191,6 @@ class Visit:
             reasons = dict.fromkeys(each.reason for each in self.unused)
             parts.append(f"{counts['not used']} not used by the fit: {'; '.join(reasons)}")
         return f"of {total} reference frame{'' if total == 1 else 's'} {', '.join(parts)}"
-
-    @property
-    def table(self) -> QTable:
-        """One row for each frame of a reference star, with the columns of `Contribution`."""
-        names = tuple(Contribution.__dataclass_fields__)
-        rows = [tuple(getattr(each, name) for name in names) for each in self.contributions]
-        kinds = [str, str, str, str, float, float, float]
-        table = QTable(rows=rows or None, names=names, dtype=kinds)
-        table["drift"].unit = "nm"
-        return table
 
 
 class Joined(NamedTuple):

@@ -27,8 +27,7 @@ from pyklip_diffrender.surveys.jobs import (
     rename_to_jobs,
     staged,
 )
-from pyklip_diffrender.surveys.stars import StarSearch, search_stars
-from pyklip_diffrender.surveys.survey_page import row, table_of, write_tables
+from pyklip_diffrender.surveys.survey_page import row, table_of
 
 _log = logging.getLogger(__name__)
 
@@ -58,9 +57,8 @@ def survey(
     config : path or mapping
         TOML file, or its content; see :doc:`the guide </howto/survey>`.
     output : path
-        Folder for ``jobs/NAME_KEY/`` with the products of each job, ``combined/STAR_KEY/`` with
-        the search over all filters and epochs of each star that has several, ``results.ecsv``,
-        ``results.parquet`` and ``survey.html``. Several surveys may use the same folder.
+        Folder for ``jobs/NAME_KEY/`` with the products of each job, ``results.ecsv`` and
+        ``survey.html``. Several surveys may use the same folder.
     scheduler : str, optional
         Address of a dask scheduler, such as ``tcp://host:8786``. Default processes on this
         machine, as many as the configuration says.
@@ -70,9 +68,7 @@ def survey(
     Returns
     -------
     Table
-        One row for each job; what is not known is masked. ``table.meta["combined"]`` has what the
-        searches over filters and epochs say: a dict for each star, with its name (`star`), the
-        `folder`, and its `candidates`, or the `reason` why it was not searched.
+        One row for each job; what is not known is masked.
 
     Raises
     ------
@@ -142,15 +138,10 @@ def run_survey(
                 board.add(job, record)
                 bar.set_postfix(failed=board.failures)
                 bar.update()
-        board.stars = search_stars(board.jobs, output, read.spectra)
     finally:
         clean(jobs)
         board.write()
-    table = table_of(board.rows)
-    table.meta["combined"] = [
-        {"star": each.star, "folder": each.folder, **each.combined} for each in board.stars
-    ]
-    return table
+    return table_of(board.rows)
 
 
 def _execute(
@@ -176,7 +167,6 @@ class _Board:
     def __init__(self, todo: list[Job], output: Path) -> None:
         self.output, self.todo = output, todo
         self.records: dict[str, Record] = {}
-        self.stars: list[StarSearch] = []
         for job in todo:
             record = read_record(output / "jobs" / job.folder)
             if record is not None:
@@ -229,11 +219,11 @@ class _Board:
         """Write tables and page; raises IncompatibleSetupError if they cannot be written."""
         from pyklip_diffrender.surveys.survey_page import page
 
-        text = page(self.jobs, self.stars)
+        text = page(self.jobs)
         # Written beside the old ones and then moved: whoever reads them meanwhile gets whole files.
         try:
             with staged(self.output / "jobs", "tables") as folder:
-                write_tables(self.rows, folder)
+                table_of(self.rows).write(folder / "results.ecsv", format="ascii.ecsv")
                 (folder / "survey.html").write_text(text, encoding="utf-8")
                 for path in folder.iterdir():
                     os.replace(path, self.output / path.name)

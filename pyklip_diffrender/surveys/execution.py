@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-import os
 import socket
-import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -142,7 +140,6 @@ def run_job(job: Job, jobs: Path, work: Work, base: Record | None = None) -> Rec
     if known is not None and known["status"] == "finished":
         return known
     began = time.perf_counter()
-    _reset_peak()
     try:
         if base is not None and base["status"] != "finished":
             raise RefinementError("the reduction without a planet failed, see there")
@@ -203,32 +200,9 @@ def _require_same_world(job: Job, jobs: Path) -> None:
 def _circumstances(began: float) -> dict[str, Any]:
     return {
         "seconds": round(time.perf_counter() - began, 3),
-        "peak_memory_bytes": _peak(),
         "ended": datetime.now(UTC).isoformat(timespec="seconds"),
         "host": socket.gethostname(),
-        "process": os.getpid(),
     }
-
-
-def _reset_peak() -> None:
-    """Make Linux forget the peak memory of the jobs that this process ran before."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-
-
-def _peak() -> int | None:
-    """Peak resident memory of this process, bytes; since `_reset_peak` on Linux."""
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
-    try:
-        import resource
-    except ImportError:  # Windows.
-        return None
-    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    # macOS counts bytes.
-    return largest if sys.platform == "darwin" else 1024 * largest
 
 
 # Jobs run in this process, or by the workers of dask.distributed.
@@ -275,7 +249,7 @@ def with_dask(
     except ImportError as error:
         raise IncompatibleSetupError(
             f"dask.distributed is needed for more than one process and is not installed ({error}): "
-            'python -m pip install "dask[distributed]" pyarrow, or set workers = 0'
+            'python -m pip install "dask[distributed]", or set workers = 0'
         ) from error
     with ExitStack() as stack:
         address: Any = scheduler
@@ -300,7 +274,9 @@ def with_dask(
                 )
             except RuntimeError as error:
                 raise IncompatibleSetupError(
-                    f"the worker processes cannot be started ({error}). " + _why_not_spawned()
+                    f"the worker processes cannot be started ({error}). A script that calls survey "
+                    "has to be a file, with `if __name__ == '__main__':`; workers = 0 does without "
+                    "processes"
                 ) from error
             address = stack.enter_context(cluster)
         try:
@@ -321,21 +297,6 @@ def with_dask(
         running = dict(zip(futures.values(), todo, strict=True))
         for future in as_completed(list(running), raise_errors=False):
             yield running[future], _record_of(future, running[future], jobs)
-
-
-def _why_not_spawned() -> str:
-    """Reason why new processes cannot import the main module, as far as it can be seen."""
-    main = sys.modules.get("__main__")
-    name = str(getattr(main, "__file__", None) or "<stdin>")
-    if name.startswith("<") and not hasattr(sys, "ps1"):
-        return (
-            "The script came from standard input, which they cannot read again, with or without a "
-            "guard: save it as a file; workers = 0 does without processes"
-        )
-    return (
-        "A script that calls survey needs `if __name__ == '__main__':`; workers = 0 does without "
-        "processes"
-    )
 
 
 def _record_of(future: Any, job: Job, jobs: Path) -> Record:

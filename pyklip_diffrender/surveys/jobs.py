@@ -250,17 +250,11 @@ def prepare(output: Path) -> Path:
     return jobs
 
 
-def staging(jobs: Path, key: str) -> Path:
-    """Make a folder for the products of a running job, which `publish` renames."""
-    path = jobs / f".{key}-{os.getpid()}-{secrets.token_hex(4)}@{_place()}"
-    path.mkdir()
-    return path
-
-
 @contextmanager
 def staged(jobs: Path, key: str) -> Iterator[Path]:
-    """Folder of `staging` that is removed in the end, unless `publish` has renamed it."""
-    folder = staging(jobs, key)
+    """New folder for the products of a running job, removed unless `publish` has renamed it."""
+    folder = jobs / f".{key}-{os.getpid()}-{secrets.token_hex(4)}@{_place()}"
+    folder.mkdir()
     try:
         yield folder
     finally:

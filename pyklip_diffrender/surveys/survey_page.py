@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +13,8 @@ from astropy.table import MaskedColumn, Table
 from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.io.progress import duration
-from pyklip_diffrender.reduction import COMPARISON
 from pyklip_diffrender.reduction.pages import Picture, count, render
 from pyklip_diffrender.surveys.jobs import Job, Record
-from pyklip_diffrender.surveys.stars import StarSearch
 
 # The table of results: one row for each job.
 
@@ -54,7 +50,6 @@ COLUMNS: dict[str, tuple[type, str]] = {
     "recovered_snr": (float, ""),
     "recovered": (bool, "whether a candidate is within 0.1 arcsec of the injected planet"),
     "seconds": (float, "duration of the job"),
-    "peak_memory_bytes": (int, "largest memory of the job"),
     "ended": (str, "time at which the job ended, UTC"),
     "host": (str, ""),
     "message": (str, ""),
@@ -69,7 +64,7 @@ Contrasts come first, because a table that is too wide to print loses its middle
 
 _COLUMN_FORMATS = {"contrast": ".2e", "snr": ".1f"}
 
-_COLUMN_UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s, "bytes": u.byte}
+_COLUMN_UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s}
 """Units by the last word of the name of a column; limits are contrasts at the separation there."""
 
 
@@ -117,30 +112,13 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def write_tables(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
-    """Write ``results.ecsv`` and, where pyarrow is installed, ``results.parquet``."""
-    table_of(rows).write(folder / "results.ecsv", format="ascii.ecsv")
-    if find_spec("pyarrow") is None:
-        return
-    import pyarrow as pa
-    from pyarrow import parquet as files
-
-    kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-    schema = pa.schema([(name, kinds[kind]) for name, (kind, _) in COLUMNS.items()])
-    table = pa.Table.from_pylist(list(rows), schema=schema)
-    files.write_table(table, folder / "results.parquet")
-
-
 # The results of a survey so far, as one HTML page that loads nothing from anywhere.
 
 Jobs = Sequence[tuple[Job, Record | None]]
 
-_MOST_TITLE_NAMES = 3
-"""Most sequences that the title names."""
 
-
-def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
-    """The page of jobs with records (None for one that waits), and of the combined searches."""
+def page(jobs: Jobs) -> str:
+    """The page of jobs with records, None for one that waits."""
     rows = [{**row(job, record), "label": str(job)} for job, record in jobs]
     states = [each["status"] for each in rows]
     done, failed, waiting = map(states.count, ("finished", "failed", "waiting"))
@@ -148,12 +126,11 @@ def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
     parts += [f"{failed} failed"] if failed else []
     parts += [f"{waiting} not finished yet"] if waiting else []
     names = list(dict.fromkeys(job.name for job, _ in jobs))
-    more = f"{names[0]} and {len(names) - 1} more sequences"
     seconds = sum(each["seconds"] or 0.0 for each in rows)
     injected = sum(job.injection is not None for job, _ in jobs)
     return render(
         "survey.html",
-        name=f"Survey of {', '.join(names) if len(names) <= _MOST_TITLE_NAMES else more}",
+        name=f"Survey of {', '.join(names) if len(names) <= 3 else count(len(names), 'sequence')}",
         version=__version__,
         now=datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
         sentence=_sentence(jobs),
@@ -168,10 +145,6 @@ def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
             ("Sequences", len(rows) - injected),
             ("Injected planets", injected),
             ("Time of all jobs", duration(seconds) if seconds else "none yet"),
-            (
-                "Largest memory of a job",
-                f"{max(each['peak_memory_bytes'] or 0 for each in rows) / 2**30:.2f} GiB",
-            ),
         ],
         rows=rows,
         pictures=_pictures(jobs),
@@ -185,10 +158,6 @@ def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
             for job, result in _reduced(jobs)
             for each in result.get("candidates", ())
         ],
-        stars=[
-            (each, found) for each in stars for found in each.combined.get("candidates") or [None]
-        ],
-        comparison=COMPARISON[0],
     )
 
 
@@ -234,7 +203,6 @@ def _pictures(jobs: Jobs) -> list[Picture]:
     figure, axes = drawing.new_figure(1, 1)
     drawing.survey_limits(axes[0, 0], curves, candidates, sigmas)
     picture = Picture(
-        "contrast_curves",
         figure,
         "Contrast, relative to the star without coronagraph, that gives S/N "
         f"{sigmas:g}, against separation, for {count(len(curves), 'sequence')}: the median of all "
