@@ -115,10 +115,6 @@ def _instrument_and_wavefront() -> list[Breakage]:
             "instrument detector_pixels",
         ),
         Breakage(
-            "flight-struts", "pupil='flight' has the obscurations seen in flight",
-            '"flight": "flight_strut"', '"flight": "strut"', "geometry instrument",
-        ),
-        Breakage(
             "quadrature", "condensed wavelengths keep the integrals of polynomials",
             "nodes.tolist()), tuple((vectors[0] ** 2).tolist()))\n\n    @property",
             "nodes.tolist()), tuple(abs(vectors[0]).tolist()))\n\n    @property", "optics",
