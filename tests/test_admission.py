@@ -178,17 +178,6 @@ def test_what_one_filter_leaves_out_another_one_uses(folder):
     assert set(reasons(short)) == {FIRST, SECOND, THIRD}
 
 
-def test_a_copy_is_seen_whatever_its_header_says(folder):
-    with fits.open(folder / SECOND) as hdus:
-        hdus[0].header.update({"OBSERVTN": "012", "DATE-BEG": "2022-10-03T10:00:00"})
-        hdus["SCI"].header["ROLL_REF"] = 85.0
-        hdus["SCI"].data[0, 90, 80] += 3.0
-        hdus.writeto(folder / "z.fits")
-    sequence = dr.ExposureSequence.from_files(folder)
-    assert as_before(sequence)
-    assert "z.fits" in reasons(sequence)
-
-
 OTHER = {"CORONMSK": "MASKA430R", "SUBARRAY": "SUB320A430R", "APERNAME": "NRCA5_MASK430R"}
 
 
