@@ -289,7 +289,7 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "checksum", "files whose data changed are refused",
-            "if stated and stated != str(of_data):", "if stated and not of_data:",
+            "if not hdu.verify_datasum():", "if hdu.verify_datasum() is None:",
             "hard/hard_files files_units",
         ),
         Breakage(
