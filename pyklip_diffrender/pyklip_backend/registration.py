@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.backend_settings import (
@@ -31,16 +31,6 @@ ALGORITHM = "diffrender"
 """Value of the argument `algo` of `klip_dataset`."""
 
 
-class Patched(Protocol):
-    """The functions of pyKLIP that are changed while the backend is in use."""
-
-    klip_dataset: PatchedFunction
-    fm_klip_dataset: PatchedFunction
-
-    def restore(self) -> None:
-        """Undo the changes."""
-
-
 class Registry:
     """The users of the backend, and the settings given to `register`."""
 
@@ -48,7 +38,7 @@ class Registry:
         # For changes of the others.
         self.lock = threading.RLock()
         # None while nobody uses the backend.
-        self.patches: Patched | None = None
+        self.patches: Patches | None = None
         self.registered = False
         # Number of `backend` blocks in all threads.
         self.blocks = 0
@@ -123,7 +113,7 @@ class Patches:
             patch.restore()
 
 
-def _patches() -> Patched:
+def _patches() -> Patches:
     """The patches that led to the present call; another thread may just have removed them."""
     patches = REGISTRY.patches
     if patches is None:
