@@ -229,7 +229,7 @@ _DECLARED = (
     Keyword("DRVERS", "version of pyklip_diffrender", "reduce, pyKLIP, psf"),
     Keyword("DRALGO", "star subtraction algorithm", "pyKLIP", "Always `diffrender`."),
     Keyword("DRIMAGE", "image in the products", "pyKLIP",
-            "`cleaned`, `flux` or `subtracted`, see `DiffrenderSettings.image`."),
+            "`cleaned` or `subtracted`, see `DiffrenderSettings.image`."),
     Keyword("DRSTAT", "how the refinement ended", "reduce, pyKLIP",
             "Name of a `Status`, such as `CONVERGED`; of several fits, the status with the "
             "largest chi-squared."),
