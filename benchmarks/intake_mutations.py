@@ -162,20 +162,6 @@ def _link(folder: Folder, name: str, _: np.random.Generator) -> None:
     folder.doubtful |= {name, f"a_{name}"}
 
 
-@_mutation("copy with another header")
-def _copy(folder: Folder, name: str, rng: np.random.Generator) -> None:
-    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
-        factor = rng.choice([1.0, 1e-3, 2.5])
-        for key in ("SCI", "ERR"):
-            hdus[key].data = hdus[key].data * factor
-        roll = float(_card(hdus, "ROLL_REF")["ROLL_REF"])
-        _set(hdus, OBSERVTN="077", FILENAME="zcopy.fits", DATE_BEG="2022-10-03T20:00:00")
-        _set(hdus, ROLL_REF=roll + 7.0)
-
-    folder.add(f"z_{rng.integers(100)}.fits", name, change, rng)
-    folder.bad.add(next(reversed(folder.sources)))
-
-
 # -- other sources in the field, products, segments ------------------------------------------------
 
 _TRANSMISSION = ((0.0, 0.3, 0.5, 0.8, 1.2, 9.0), (0.01, 0.055, 0.26, 0.71, 0.95, 1.0))

@@ -11,27 +11,13 @@ from pyklip_diffrender.instrument import FLIGHT_ALIGNMENT, nircam_coronagraph
 CALL = {"monochromatic": 4.5e-6, "fft_oversample": 4, "detector_oversample": 2, "fov_pixels": 80}
 FULL = {"fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 80}
 BARE = {"nd_squares": False}
-MIDDLE = {"bar_offset": 0.0}
-"""Where a bar of module B has its aperture; stpsf takes a filter's place in module A."""
 
 # A wavelength of a filter, and that at which stpsf has no wedge tilt.
-WAVES = {"F444W": (4.5e-6, 3.35e-6), "F356W": (3.5e-6, 3.35e-6), "F210M": (2.05e-6, 2.10e-6)}
-B = {"module": "B"}
+WAVES = {"F444W": (4.5e-6, 3.35e-6)}
 # Mask and filter; stpsf's options, ours, and the limit on the mean difference in units of the mean
-# light there: the ends of bars are sharp; in module A it is the same.
+# light there.
 EMBEDDED = {
     "MASK335R": ("MASK335R", "F444W", {}, {}, 5e-3),
-    "MASK430R, module B": ("MASK430R", "F356W", {"aperture": "NRCB5_MASK430R"}, B, 5e-3),
-    "MASK210R, module B": ("MASK210R", "F210M", {"aperture": "NRCB1_MASK210R"}, B, 5e-3),
-    "MASKSWB, module B": (
-        "MASKSWB", "F210M", {"aperture": "NRCB3_MASKSWB", "pupil_mask": "MASKSWB", **MIDDLE}, B,
-        0.01,
-    ),
-    "MASKLWB, module B": (
-        "MASKLWB", "F444W", {"aperture": "NRCB5_MASKLWB", "pupil_mask": "MASKLWB", **MIDDLE}, B,
-        0.01,
-    ),
-    "flight pupil": ("MASK335R", "F444W", {"pupil": "flight"}, {"pupil": "flight"}, 5e-3),
     # Published for stpsf's options; poppy cuts the shifts to 13 and 7 samples.
     "flight alignment": (
         "MASK335R", "F444W",

@@ -45,8 +45,7 @@ def reduce(dataset, folder, **kw):
 
 
 def gathered(dataset, library=()):
-    every = np.arange(len(dataset.input))
-    return frames_of(dataset, every, np.asarray(dataset.input), DiffrenderSettings(), library)
+    return frames_of(dataset, np.asarray(dataset.input), DiffrenderSettings(), library)
 
 
 def test_rolls_are_pointings_with_the_headers_of_their_files(files):

@@ -110,7 +110,7 @@ def test_the_joint_basis_keeps_kinds_apart():
 
 def test_the_aperture_tells_jwst_from_other_telescopes():
     npix = 64
-    for options in ({}, {"pupil": "flight"}, {"segment_gap": 0.03}):
+    for options in ({}, {"segment_gap": 0.03}):
         assert is_jwst_pupil(jwst_pupil(npix, **options) > 0, JWST_DIAMETER)
     padded = torch.nn.functional.pad(jwst_pupil(npix) > 0, (npix // 4,) * 4)
     assert is_jwst_pupil(padded, 1.5 * JWST_DIAMETER)

@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import scipy.ndimage
 import torch
 from astropy.io import fits
 from astropy.table import Table
@@ -80,14 +79,7 @@ def test_places_on_the_detector_count_from_zero():
 REFUSED = {
     r"'MASKA335R'.*MASK335R": partial(instrument.detector_place, "MASKA335R", "F444W"),
     r"'F150W'.*F182M.*F480M": partial(instrument.detector_place, "MASK335R", "F150W"),
-    "'b', expected 'A' or 'B'": partial(instrument.detector_place, "MASK335R", "F444W", module="b"),
     r"F182M.*F480M, not for 'F277W'": partial(instrument.filter_shift, "F277W"),
-    r"NRCA5.*F210M.*NRCA2; use crosstalk=False": partial(
-        instrument.nircam_coronagraph, "F210M", image_mask="MASK210R", crosstalk=True
-    ),
-    r"NRCA5.*F444W.*NRCB5; use crosstalk=False": partial(
-        instrument.nircam_coronagraph, "F444W", module="B", crosstalk=True
-    ),
     **{
         message: partial(instrument.nircam_coronagraph, "F444W", **argument)
         for message, argument in {
@@ -107,42 +99,6 @@ def test_what_is_not_known_is_refused_with_what_is(complaint):
         REFUSED[complaint]()
 
 
-@pytest.mark.parametrize("mask", instrument.MASKS)
-def test_module_b_has_every_mask_in_one_channel(mask):
-    own, other = ("F210M", "F444W")[:: 1 if mask in ("MASK210R", "MASKSWB") else -1]
-    place = instrument.detector_place(mask, own, module="B")
-    assert (place.module, place.place, place.offset) == ("B", "-", 0.0)
-    with pytest.raises(IncompatibleSetupError, match=rf"B does not have {mask} in {other}, only"):
-        instrument.nircam_coronagraph(other, image_mask=mask, module="B")
-    with pytest.raises(IncompatibleSetupError, match=rf"place along {mask} in module B: -$"):
-        instrument.nircam_coronagraph(own, image_mask=mask, module="B", bar_place="NARROW")
-
-
-IPC = [[3.86e-4, 5.972e-3, 3.86e-4], [5.972e-3, 0.974569, 5.972e-3], [3.86e-4, 5.972e-3, 3.86e-4]]
-PPC = [[0, 0, 0], [0, 0.99877, 0.00123], [0, 0, 0]]
-
-
-def coupled(image):
-    """The kernels of NRCA5 as scipy convolves with them, zero beyond the edges."""
-    for kernel in (IPC, PPC):
-        image = scipy.ndimage.convolve(image, np.array(kernel) / np.sum(kernel), mode="constant")
-    return image
-
-
-@pytest.mark.parametrize("values", [{}, {"blur": 0.026, "star_offset": (0.4, 0)}])
-@pytest.mark.parametrize("oversample", [1, 2])
-def test_crosstalk_couples_pixels_after_everything_else(values, oversample, opd):
-    settings = {"nlambda": 1, "oversample": oversample, **SMALL}
-    plain, model = (
-        instrument.nircam_coronagraph(**settings, crosstalk=each)(opd, **values).numpy()
-        for each in (False, True)
-    )
-    truth = coupled(plain)
-    # The kernels above are rounded to 4 digits.
-    assert np.abs(model - truth).max() < 2e-6 * truth.max()
-    assert np.abs(plain - truth).max() > 5e-3 * truth.max()
-
-
 @pytest.mark.parametrize("name", instrument.FILTERS)
 def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official_files, name):
     data = fits.getdata(official_files / "NIRCam" / "filters" / f"{name}_throughput.fits")
@@ -156,37 +112,31 @@ def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official
     assert mine.sum() == pytest.approx(truth.sum(), rel=2e-3)
 
 
-@pytest.mark.parametrize("module", ["A", "B"])
-def test_aberrations_are_those_of_the_official_field_points(official_files, module):
+def test_aberrations_are_those_of_the_official_field_points(official_files):
     table = Table.read(official_files / "si_zernikes_coron_wfe.fits")
     places = [(r["instrument"].strip(), r["field_point_name"].strip()) for r in table]
     for short_wave, mask in itertools.product((True, False), instrument.MASKS):
-        channel = f"NIRCam{'SW' if short_wave else 'LW'}{module}"
-        row = table[places.index((channel, f"Z{mask[4:]}_{module}"))]
+        channel = f"NIRCam{'SW' if short_wave else 'LW'}A"
+        row = table[places.index((channel, f"Z{mask[4:]}_A"))]
         truth = np.array([row[f"Zernike_{k}"] for k in range(1, 37)])
-        mine = instrument.internal_wavefront_error(mask, short_wave=short_wave, module=module)
+        mine = instrument.internal_wavefront_error(mask, short_wave=short_wave)
         np.testing.assert_allclose(mine, truth, rtol=1e-3, atol=1e-18)
 
 
 @pytest.mark.parametrize(
-    ("mask", "filter_name", "module"),
-    [
-        *itertools.product(instrument.MASKS, ("F210M", "F444W"), "A"),
-        *itertools.product(("MASK210R", "MASKSWB"), ["F210M"], "B"),
-        *itertools.product(("MASK335R", "MASK430R", "MASKLWB"), ["F444W"], "B"),
-    ],
+    ("mask", "filter_name"), list(itertools.product(instrument.MASKS, ("F210M", "F444W")))
 )
-def test_pixels_and_places_are_those_of_the_siaf(mask, filter_name, module):
+def test_pixels_and_places_are_those_of_the_siaf(mask, filter_name):
     pysiaf = pytest.importorskip("pysiaf")
-    place = instrument.detector_place(mask, filter_name, module=module)
+    place = instrument.detector_place(mask, filter_name)
     assert place.short_wave == instrument.is_short_wave(filter_name)
     along = "" if place.place == "-" else f"_{place.place}"
-    siaf, full = pysiaf.Siaf("NIRCam"), "_FULL" if module == "A" else ""
-    aperture = siaf[f"{place.detector}{full}_{mask}{along}"]
+    siaf = pysiaf.Siaf("NIRCam")
+    aperture = siaf[f"{place.detector}_FULL_{mask}{along}"]
     scale = (aperture.XSciScale, aperture.YSciScale)
     assert place.siaf_pixelscale == pytest.approx(scale, abs=6e-9)
     whole = siaf[f"{place.detector}_FULL"].det_to_sci(aperture.XDetRef, aperture.YDetRef)
     # The places measured in flight are up to 3.4 pixels from those of the SIAF.
-    assert np.add(place.center, 1) == pytest.approx(whole, abs=3.5 if module == "A" else 0.005)
+    assert np.add(place.center, 1) == pytest.approx(whole, abs=3.5)
     x, y = aperture.sci_to_idl(aperture.XSciRef + np.array([-40, 40]), np.full(2, aperture.YSciRef))
     assert place.siaf_shear == pytest.approx(np.diff(y) / np.diff(x), abs=1e-4)

@@ -105,7 +105,7 @@ def test_pyklip_datasets_take_about_twice_their_file(tmp_path, monkeypatch):
     def gathered():
         dataset = datasets[-1]
         settings = dr.pyklip_backend.DiffrenderSettings()
-        return dataset_frames.frames_of(dataset, np.arange(MANY), dataset.input, settings)
+        return dataset_frames.frames_of(dataset, dataset.input, settings)
 
     dr.register(opd="flat")
     try:

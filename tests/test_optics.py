@@ -293,7 +293,6 @@ LEGAL = r".*F182M.*F212N \(short wave\) or F250M.*F480M \(long wave\)"
         ({"image_mask": "MASKXWB"}, "MASK210R.*MASKLWB"),
         ({"pupil_mask": "MASKLWB"}, "MASKRND.*MASKBAR"),
         ({"image_mask": "MASKLWB", "bar_place": "F210M"}, "bar_place.*'F210M'.*F444W.*NARROW"),
-        ({"pupil": "RevW"}, "'design' or 'flight'"),
         ({"defaults": {"star_offset": (0.1, 0.0)}}, "belongs to a source"),
         ({"fov_pixels": 10, "fov_arcsec": 1.0}, "not both"), ({"fov_pixels": 0}, "at least 1"),
         ({"occulter_sampling": 0.5}, "at least 1"), ({"dtype": torch.float16}, "float32"),

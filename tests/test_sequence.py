@@ -89,9 +89,7 @@ def test_names_are_the_same_in_any_spelling(first, second, same):
     ("arguments", "words"),
     [
         ({"target": "VEGA"}, r"'VEGA', expected one of 'AU MIC', 'HIP1'$"),
-        ({"target": "AU Microscopii"}, r"Did you mean 'AU MIC'\?"),
-        ({"target": "HIP 17695"}, r"expected one of 'AU MIC', 'HIP1'$"),
-        ({"filter": "F445W"}, r"filter: got 'F445W'.* mean 'F444W'\?"),
+        ({"filter": "F445W"}, r"filter: got 'F445W', expected one of 'F444W'"),
         ({}, "choose one with"),
     ],
 )

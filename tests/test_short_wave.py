@@ -1,4 +1,4 @@
-"""The short-wave arm and module B: frames like those of MAST, from reading to the planet."""
+"""The short-wave arm: frames like those of MAST, from reading to the planet."""
 
 from dataclasses import replace
 from functools import cache
@@ -10,12 +10,11 @@ import torch
 from astropy import units as u
 from astropy.io import fits
 
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.instrument import detector_place, filter_shift, nircam_coronagraph
 from pyklip_diffrender.reduction import reduce
 from pyklip_diffrender.refinement import FitSettings, refine, settings_for
 from pyklip_diffrender.scene import ExposureSequence, Observation, Planet, model_for
-from pyklip_diffrender.scene.aligned_frames import mask_place
 from pyklip_diffrender.wavefront import random_opd
 
 SIZE = 36
@@ -31,7 +30,7 @@ def scene(place):
     """Photons of a star and its planet behind MASK335R, 64 x 64 pixels."""
     scale = place.siaf_pixelscale
     model = nircam_coronagraph(
-        "F210M" if place.short_wave else "F444W", image_mask="MASK335R", module=place.module,
+        "F210M" if place.short_wave else "F444W", image_mask="MASK335R",
         npix=256, nlambda=5, fov_pixels=64, pixelscale=scale, shear=place.siaf_shear,
         # Not where the fit starts.
         defaults={"lyot_shift": (-0.006, 0.004), "lyot_rotation": 0.2},
@@ -44,17 +43,17 @@ def scene(place):
     return PHOTONS * light.numpy()
 
 
-def calints(folder, filter="F210M", module="A"):
+def calints(folder, filter="F210M"):
     """Write a frame as MAST delivers it."""
-    place = detector_place("MASK335R", filter, module=module)
+    place = detector_place("MASK335R", filter)
     counts = scene(place)
     sigma = np.sqrt(counts + NOISE**2)
     counts = counts + sigma * np.random.default_rng(0).normal(size=sigma.shape)
     corner = np.round(np.add(place.center, filter_shift(filter)) - CENTER) + 1
     primary = {
         "TELESCOP": "JWST", "EXP_TYPE": "NRC_CORON", "DETECTOR": place.header_detector,
-        "MODULE": module, "FILTER": filter, "PUPIL": "MASKRND", "CORONMSK": f"MASK{module}335R",
-        "SUBARRAY": f"SUB320{module}335R", "APERNAME": f"{place.detector}_MASK335R",
+        "MODULE": "A", "FILTER": filter, "PUPIL": "MASKRND", "CORONMSK": "MASKA335R",
+        "SUBARRAY": "SUB320A335R", "APERNAME": f"{place.detector}_MASK335R",
         "TARGPROP": "HD 1", "SUBSTRT1": int(corner[0]), "SUBSTRT2": int(corner[1]),
     }  # fmt: skip
     area = float(np.prod(place.siaf_pixelscale))
@@ -66,11 +65,10 @@ def calints(folder, filter="F210M", module="A"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("filter", "module"), [("F210M", "A"), ("F444W", "B")])
-def test_a_planet_is_where_it_is_and_nothing_else(tmp_path, filter, module):
+def test_a_planet_is_where_it_is_and_nothing_else(tmp_path):
     """A map that is 5 nm rms off, a star and a stop off their places, and no detector pattern."""
-    settings = FitSettings.nircam(filter, module=module, cycles=(7.0,), max_iterations=10)
-    frame, opd = calints(tmp_path, filter, module), random_opd(1, npix=256)
+    settings = FitSettings.nircam("F210M", cycles=(7.0,), max_iterations=10)
+    frame, opd = calints(tmp_path), random_opd(1, npix=256)
     result = reduce([frame], opd, size=SIZE, settings=settings)
     assert result.pattern is None
     assert result.fit is result.detection.fits[0]
@@ -105,26 +103,19 @@ def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path):
     assert settings_for(wide).cycles == (32.0,)
 
 
-def test_frames_of_module_b_have_its_model(tmp_path):
-    """Nothing that was measured in flight with module A is taken for it."""
-    path = calints(tmp_path, "F444W", "B")
-    (frame,) = ExposureSequence.from_files([path]).science
-    assert frame.header["DETECTOR"] == "NRCBLONG"
-    model = model_for(frame, SIZE)
-    assert model.setup["module"] == "B"
-    place = detector_place("MASK335R", "F444W", module="B")
-    assert model.detector.pixelscale == place.siaf_pixelscale
-    assert not model.defaults
-    assert mask_place(frame.header, frame.name) is None
-    known = FitSettings.nircam("F444W").deviations["lyot_shift"]
-    assert settings_for(frame).deviations["lyot_shift"] > 2 * known
+def test_frames_of_module_b_are_refused(tmp_path):
+    """JWST does not observe with it, and its masks are at other places."""
+    (frame,) = ExposureSequence.from_files([calints(tmp_path, "F444W")]).science
+    frame.header.update({"CORONMSK": "MASKB335R", "SUBARRAY": "SUB320B335R", "MODULE": "B"})
+    frame.header.update({"DETECTOR": "NRCBLONG", "APERNAME": "NRCB5_MASK335R"})
+    with pytest.raises(IncompatibleSetupError, match="detector NRCBLONG, expected NRCALONG"):
+        model_for(frame, SIZE)
     with pytest.raises(IncompatibleSetupError, match="have module B, the model A"):
         refine(nircam_coronagraph("F444W", npix=128, fov_pixels=64), [frame], "flat")
-    for key in ("DETECTOR", "MODULE", "SUBARRAY"):
+    for key in ("DETECTOR", "APERNAME"):
         del frame.header[key]
-    # The archive's name of the file names the detector, CORONMSK the module.
-    assert model_for(frame, SIZE) is model
-    assert model_for(replace(frame, name="a frame"), SIZE) is model
+    with pytest.raises(IncompatibleSetupError, match="of module B, expected NRCALONG"):
+        model_for(replace(frame, name="a frame"), SIZE)
 
 
 def test_what_is_not_modelled_is_refused(tmp_path):
@@ -134,10 +125,7 @@ def test_what_is_not_modelled_is_refused(tmp_path):
     with pytest.raises(IncompatibleSetupError, match=r"detector NRCA4, expected NRCA2"):
         model_for(frame, SIZE)
     frame.header["DETECTOR"] = "NRCB1"
-    with pytest.raises(CorruptFileError, match=r"NRCB1, MODULE A.* name different modules"):
-        model_for(frame, SIZE)
-    frame.header.update({"MODULE": "B", "CORONMSK": "MASKB335R", "SUBARRAY": "SUB320B335R"})
-    with pytest.raises(IncompatibleSetupError, match=r"B does not have MASK335R in F210M.*NRCB5"):
+    with pytest.raises(IncompatibleSetupError, match=r"detector NRCB1, expected NRCA2"):
         model_for(frame, SIZE)
     fits.setval(path, "INSTRUME", value="MIRI")
     with pytest.raises(NoValidPixelsError, match="taken with MIRI; only NIRCam"):

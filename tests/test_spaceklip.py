@@ -185,7 +185,7 @@ def test_a_failure_is_reported_after_the_others(tmp_path, monkeypatch, caplog):
     }  # fmt: skip
     database = StandIn(tmp_path, obs)
 
-    def reduced(key, table, judged, folder, *others):
+    def reduced(key, table, sequence, folder, *others):
         if key == "bad":
             raise IncompatibleSetupError("no such filter")
         return stub_product(folder, "F444W"), fake_detection((-0.3, 0.4), 0.0)
@@ -225,7 +225,7 @@ def test_concatenations_of_one_target_are_searched_together(tmp_path, monkeypatc
     files = {key: [str(calints(tmp_path / f"{key}_calints.fits"))] for key in made}
     obs = {k: concatenation(files[k], FILTER=made[k].observation.filter) for k in made}
 
-    def reduced(key, table, judged, folder, *others):
+    def reduced(key, table, sequence, folder, *others):
         return stub_product(folder, key), made[key]
 
     monkeypatch.setattr(run, "_reduced", reduced)
@@ -257,9 +257,9 @@ def test_files_are_judged_before_any_is_fitted(tmp_path):
     table = concatenation([*rolls, str(confirmation), str(own), str(other)])
     table["TYPE"] = ["SCI"] * 3 + ["REF"] * 2
     with pytest.warns(DiffrenderWarning) as caught:
-        left, judged = run._admitted(KEY, table)
+        left, sequence = run._admitted(KEY, table)
     assert list(left["FITSFILE"]) == [*rolls, str(other)]
-    uses = {row["file"]: row["use"] for row in judged.sequence.table}
+    uses = {row["file"]: row["use"] for row in sequence.table}
     assert uses == {
         "1_calints.fits": "target", "2_calints.fits": "target", "psf.fits": "reference",
         "own.fits": "excluded", "ta.fits": "excluded",

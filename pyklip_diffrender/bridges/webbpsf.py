@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.poppy import WRITTEN_BY_CALLER, PoppySystem, check_supported
 from pyklip_diffrender.bridges.sampled_planes import AberrationOptic, SplineRotation
-from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.io.headers import set_keyword
 from pyklip_diffrender.io.units import to_metres, to_number
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -78,16 +78,15 @@ def band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[
     """Wavelengths (m) and weights of a `Bandpass`, otherwise by stpsf.
 
     `recipe` has "bandpass", "monochromatic", "nlambda" and "source", each possibly None.
-    IncompatibleSetupError for a wavelength that the instrument's channel does not pass; a warning
-    for a single one outside the filter.
+    IncompatibleSetupError for a wavelength that the instrument's channel does not pass.
     """
     bandpass: Bandpass | None = recipe["bandpass"]
-    monochromatic = None
     if bandpass is not None:
         wavelengths, weights = bandpass.wavelengths, bandpass.weights
     else:
-        if recipe["monochromatic"] is not None:
-            monochromatic = float(to_metres(recipe["monochromatic"], "monochromatic"))
+        monochromatic = recipe["monochromatic"]
+        if monochromatic is not None:
+            monochromatic = float(to_metres(monochromatic, "monochromatic"))
         with data_errors():
             wavelengths, weights = instrument._get_weights(
                 source=recipe["source"], nlambda=recipe["nlambda"], monochromatic=monochromatic
@@ -100,26 +99,7 @@ def band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[
             f"wavelengths {min(waves):.4g} to {max(waves):.4g} m with {instrument.filter}: "
             f"{error}. Wavelengths are in metres"
         ) from error
-    if monochromatic is not None:
-        _warn_outside(instrument, monochromatic)
     return waves, [float(w) for w in np.atleast_1d(weights)]
-
-
-def _warn_outside(instrument: Any, wavelength: float) -> None:
-    """Warn of a wavelength outside the filter, which stpsf accepts silently."""
-    path = instrument._filters[instrument.filter].filename
-    if not os.path.exists(path):
-        return  # stpsf needs the curve only for broadband PSFs.
-    table = fits.getdata(path, 1)
-    used = np.asarray(table["THROUGHPUT"], dtype=float)
-    passed = np.asarray(table["WAVELENGTH"], dtype=float)[used > 1e-3 * used.max()] * 1e-10
-    if not passed.min() <= wavelength <= passed.max():
-        warnings.warn(
-            f"monochromatic: {wavelength:.4g} m is outside {instrument.filter} ({passed.min():.4g} "
-            f"to {passed.max():.4g} m); the filter only names the PSF",
-            DiffrenderWarning,
-            stacklevel=4,
-        )
 
 
 @contextmanager

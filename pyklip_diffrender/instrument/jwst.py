@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import embedded_table
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
 
@@ -68,20 +67,14 @@ def is_jwst_pupil(lit: Tensor, diameter: float) -> bool:
     return inside and int((lit & full).sum()) > 0.95 * int(full.sum())
 
 
-def jwst_pupil(npix: int, segment_gap: float | None = None, pupil: str = "design") -> Tensor:
+def jwst_pupil(npix: int, segment_gap: float | None = None) -> Tensor:
     """Amplitude transmission of JWST's entrance pupil, (npix, npix) over 6.603464 m, float64.
 
     The transmission is the covered fraction of a pixel's area. `segment_gap` is the width of the
     gaps between the segments, m, by default 7.7 mm as in the embedded outlines.
-    IncompatibleSetupError for a `pupil` other than "design" or "flight".
     """
-    # Struts of the secondary mirror as designed (stpsf's pupil "RevW"), or as in NIRCam's pupil
-    # images ("Flight V1": the vertical strut is 7 % narrower, and all three have hinges). Behind
-    # MASK335R in F444W the star's image differs by 0.6 to 1.3 % of its local intensity; a map of
-    # 1024 samples and these outlines differ by 0.1 to 0.2 %.
-    kinds = {"design": "strut", "flight": "flight_strut"}
-    if pupil not in kinds:
-        raise IncompatibleSetupError(f"pupil: got {pupil!r}, expected 'design' or 'flight'")
+    # Struts of the secondary mirror as designed, stpsf's pupil "RevW". A map of 1024 samples and
+    # these outlines differ by 0.1 to 0.2 %.
     # Where struts cross segment edges inside a pixel, the product of coverages is approximate, so
     # small arrays are averages of a fine one.
     fine = npix * max(1, -(-1024 // npix))
@@ -93,6 +86,6 @@ def jwst_pupil(npix: int, segment_gap: float | None = None, pupil: str = "design
         outlines = [widen_polygon(outline, growth) for outline in outlines]
     # Outlines without gaps overlap by up to a tenth of a millimetre where three of them meet.
     amplitude = polygon_coverage(outlines, grid).clamp(max=1.0)
-    for strut in _polygons("jwst_primary_polygons", "name", kind=kinds[pupil]).values():
+    for strut in _polygons("jwst_primary_polygons", "name", kind="strut").values():
         amplitude = amplitude * (1 - polygon_coverage([strut], grid))
     return amplitude.reshape(npix, fine // npix, npix, fine // npix).mean(dim=(1, 3))

@@ -151,11 +151,10 @@ class DetectorPlace:
     mask: str
     # Place along a bar: a filter, for its fiducial, or "NARROW"; "-" is the middle.
     place: str
-    # As SIAF names it: NRCA2, NRCA4, NRCB1 or NRCB3 (short wave), NRCA5 or NRCB5 (long wave).
+    # As SIAF names it: NRCA2 or NRCA4 (short wave), NRCA5 (long wave).
     detector: str
     # x, y of the mask on the full detector in F335M (short wave: F210M), pixels of the science
     # frame counted from 0 at the middle of the first one. In another filter add `filter_shift`.
-    # Module B has the place of the SIAF, which in module A is up to 3.4 pixels away.
     center: tuple[float, float]
     siaf_pixelscale: tuple[float, float]  # x, y, arcsec per pixel (SIAF, PRDOPSSOC-075)
     # Growth of the ideal y with the ideal x, from the SIAF polynomial: the mean over +-40 pixels.
@@ -185,18 +184,13 @@ class DetectorPlace:
         return self.detector.replace("5", "LONG")
 
     @property
-    def module(self) -> str:
-        """NIRCam's module, A or B."""
-        return self.detector[3]
-
-    @property
     def short_wave(self) -> bool:
         """Whether the detector is one of the short-wave channel."""
         return not self.detector.endswith("5")
 
 
 @lru_cache(maxsize=1)
-def _places() -> dict[tuple[str, str, bool, str], DetectorPlace]:
+def _places() -> dict[tuple[str, str, bool], DetectorPlace]:
     places = (
         DetectorPlace(
             str(row["mask"]),
@@ -209,7 +203,7 @@ def _places() -> dict[tuple[str, str, bool, str], DetectorPlace]:
         )
         for row in embedded_table("nircam_masks")
     )
-    return {(each.mask, each.place, each.short_wave, each.module): each for each in places}
+    return {(each.mask, each.place, each.short_wave): each for each in places}
 
 
 def is_short_wave(filter: str) -> bool:
@@ -234,50 +228,35 @@ def require_mask(mask: str) -> RoundMask | BarMask:
     return MASKS[mask]
 
 
-def detector_place(
-    mask: str | None, filter: str, place: str | None = None, module: str = "A"
-) -> DetectorPlace:
+def detector_place(mask: str | None, filter: str, place: str | None = None) -> DetectorPlace:
     """Place of a mask on the detector in a filter, and the pixels there.
 
     Without a mask, the place belongs to the mask that is made for the filter's channel
     (MASK210R or MASK335R). `place` is the star's along a bar: a filter of its channel, for the
     fiducial of that filter, "NARROW", or "-", the middle; default the fiducial of `filter`, or the
-    middle if it has none. IncompatibleSetupError for an unknown mask, filter, place or module, or a
-    mask that the module does not have in the filter's channel.
+    middle if it has none. The detectors are those of module A, with which JWST observes.
+    IncompatibleSetupError for an unknown mask, filter or place.
     """
     short_wave = is_short_wave(filter)
     if mask is None:
         mask = "MASK210R" if short_wave else "MASK335R"
     require_mask(mask)
-    if module not in ("A", "B"):
-        raise IncompatibleSetupError(f"module: got {module!r}, expected 'A' or 'B'")
     places = _places()
-    # In B there are MASK210R and MASKSWB in the short-wave channel, MASK335R, MASK430R and MASKLWB
-    # in the long-wave one, and no place along a bar but the middle.
-    if (mask, "-", short_wave, module) not in places:
-        there = [f"{each.mask} ({each.detector})" for each in places.values() if each.module == "B"]
-        raise IncompatibleSetupError(
-            f"module: B does not have {mask} in {filter}, only {', '.join(there)}"
-        )
-    own = filter.upper() if (mask, filter.upper(), short_wave, module) in places else "-"
-    key = (mask, own if place is None else place.upper(), short_wave, module)
+    own = filter.upper() if (mask, filter.upper(), short_wave) in places else "-"
+    key = (mask, own if place is None else place.upper(), short_wave)
     if key not in places:
-        known = [
-            each.place for each in places.values() if (each.mask, each.module) == (mask, module)
-        ]
+        known = dict.fromkeys(each.place for each in places.values() if each.mask == mask)
         raise IncompatibleSetupError(
-            f"bar_place: got {place!r}, expected a place along {mask} in module {module}: "
-            f"{', '.join(dict.fromkeys(known))}"
+            f"bar_place: got {place!r}, expected a place along {mask}: {', '.join(known)}"
         )
     return places[key]
 
 
-def stop_is_measured(mask: str | None, short_wave: bool, module: str | None = None) -> bool:
+def stop_is_measured(mask: str | None, short_wave: bool) -> bool:
     """Whether the alignment of the Lyot stop of a mask was measured in flight."""
     # The alignment of MASKRND, the stop of all masks but the bars, was measured in the long-wave
-    # channel of module A.
-    is_bar = isinstance(MASKS.get(mask or ""), BarMask)
-    return not is_bar and not short_wave and module != "B"
+    # channel.
+    return not short_wave and not isinstance(MASKS.get(mask or ""), BarMask)
 
 
 def mask_of_header(value: object) -> str:

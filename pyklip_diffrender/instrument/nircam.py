@@ -7,7 +7,6 @@ from functools import lru_cache
 from numbers import Integral
 from typing import Any
 
-import numpy as np
 import torch
 from astropy import units as u
 from numpy.polynomial import Polynomial
@@ -23,13 +22,11 @@ from pyklip_diffrender.io.units import Bound, require_shape, to_metres, to_numbe
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, noll_indices, samples_for_field
 from pyklip_diffrender.optics.planes import (
-    ChainDetector,
     CompactOcculter,
     Detector,
     EntrancePupil,
     InternalAberration,
     LyotStop,
-    PixelCrosstalk,
     Plane,
 )
 from pyklip_diffrender.optics.propagation import Value
@@ -59,9 +56,6 @@ _WEDGE_TILT = (
 _TABULATED_WAVELENGTHS_MICRON = (2.12, 3.23)
 """Wavelengths of the tabulated wavefront error, micron."""
 
-_MIRRORED = {"MASKSWB": "MASKLWB", "MASKLWB": "MASKSWB"}
-"""Masks of module A whose place is the mirror image of another mask's in module B."""
-
 
 class ChromaticAberration:
     """Focus and wedge tilt in addition to the tabulated wavefront error.
@@ -86,17 +80,13 @@ class ChromaticAberration:
 
 
 def internal_wavefront_error(
-    mask: str = "MASK335R", flip: bool = True, *, short_wave: bool = False, module: str = "A"
+    mask: str = "MASK335R", flip: bool = True, *, short_wave: bool = False
 ) -> Tensor:
     """NIRCam's internal wavefront error at a mask: Noll coefficients in m, (36,), float64.
 
     The coefficients are in entrance-pupil orientation, of the map flipped vertically; with `flip`
     False, of the map in the tabulated orientation of the exit pupil, as in stpsf before 2.2.0.
     """
-    # STScI's table has the same values for B as for A, at places mirrored in V2. There the two bars
-    # change places.
-    if module == "B":
-        mask = _MIRRORED.get(mask, mask)
     # stpsf flips the map from 2.2.0 on, because that matches images in flight better. The flip
     # cancels the inversion of y between exit and entrance pupil.
     exit_pupil = torch.tensor(_table(mask, short_wave), dtype=torch.float64) * 1e-9
@@ -133,25 +123,14 @@ has the stop aligned. Alignment-only fits of this package to one frame each of t
 shifts of -0.0109 to -0.0121 and 0.0040 to 0.0054 and rotations of 0.39 to 0.54 deg.
 """
 
-# Interpixel capacitance and post-pixel coupling of the detector NRCA5, as in stpsf's kernels for
-# the sensor 485: J. Leisenring, ground tests (ISIM CV3).
-_IPC_NRCA5 = np.array(
-    [
-        [3.85864e-4, 5.971866e-3, 3.85864e-4],
-        [5.971866e-3, 0.974569081, 5.971866e-3],
-        [3.85864e-4, 5.971866e-3, 3.85864e-4],
-    ]
-)
-_PPC_NRCA5 = np.array([[0.0, 0.99876965, 0.00123035]])
-
 
 _LYOT_OPENINGS = {"MASKRND": maskrnd_openings, "MASKBAR": maskbar_openings}
 """The Lyot stops, in both channels."""
 
 
 @lru_cache(maxsize=4)
-def _pupil(npix: int, segment_gap: float | None, pupil: str) -> Tensor:
-    return jwst_pupil(npix, segment_gap, pupil)
+def _pupil(npix: int, segment_gap: float | None) -> Tensor:
+    return jwst_pupil(npix, segment_gap)
 
 
 def nircam_coronagraph(
@@ -165,12 +144,9 @@ def nircam_coronagraph(
     source: float | tuple[ArrayLike, ArrayLike] = 5700.0,
     pixelscale: float | tuple[float, float] | None = None,
     shear: float = 0.0,
-    crosstalk: bool = False,
     image_mask: str | None = "MASK335R",
-    module: str = "A",
     bar_place: str | None = None,
     pupil_mask: str | None = "auto",
-    pupil: str = "design",
     segment_gap: float | None = None,
     si_wfe: bool | ArrayLike = True,
     flip_si_wfe: bool = True,
@@ -210,22 +186,15 @@ def nircam_coronagraph(
         not square on the sky, ``detector_place(mask, filter).siaf_pixelscale``.
     shear : float
         See `Detector`; for real frames, ``detector_place(mask, filter).siaf_shear``.
-    crosstalk : bool
-        Couple neighbouring pixels as in the detector NRCA5 (interpixel capacitance and post-pixel
-        coupling), which the pipeline does not remove from calibrated JWST frames.
     image_mask : str or None
         "MASK210R", "MASK335R", "MASK430R", or the bars "MASKSWB" and "MASKLWB", each with the
         filters of both channels, or None for no occulter (a planet far from the star).
-    module : "A" or "B"
-        JWST observes with A. For masks and filters in B see `detector_place`.
     bar_place : str, optional
         Where along a bar the star is: at the fiducial of a filter, such as "F460M", at the
         "NARROW" end, or in the middle, "-". Default the fiducial of `filter`, or the middle if
         `filter` is of the other channel.
     pupil_mask : "auto", "MASKRND", "MASKBAR" or None
         Lyot stop; "auto" is the stop of the mask.
-    pupil : "design" or "flight"
-        Obscurations of the primary mirror, see `jwst_pupil`.
     segment_gap : float, optional
         Width of the gaps between mirror segments, m; default as in the embedded outlines.
     si_wfe : bool or (36,) array
@@ -271,14 +240,14 @@ def nircam_coronagraph(
     (24, 24)
     """
     recipe = _in_plain_numbers(dict(locals()))
-    place = detector_place(image_mask, filter, bar_place, module)
+    place = detector_place(image_mask, filter, bar_place)
     if pupil_mask == "auto":
         recipe["pupil_mask"] = require_mask(place.mask).stop
-    _require_supported(place, recipe)
+    _require_supported(recipe)
     bandpass = _bandpass(recipe)
     detector = _detector(place, recipe)
     _require_samples(npix, place.period(bar_reach) if image_mask else 0.0, detector, bandpass)
-    amplitude = _pupil(npix, recipe["segment_gap"], pupil).to(detector.device)
+    amplitude = _pupil(npix, recipe["segment_gap"]).to(detector.device)
     return InstrumentSystem(
         EntrancePupil(amplitude, JWST_DIAMETER, dtype, name="JWST pupil"),
         _planes(place, bandpass, recipe),
@@ -334,16 +303,11 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
     return recipe
 
 
-def _require_supported(place: DetectorPlace, recipe: Mapping[str, Any]) -> None:
+def _require_supported(recipe: Mapping[str, Any]) -> None:
     if recipe["pupil_mask"] not in (None, *_LYOT_OPENINGS):
         raise IncompatibleSetupError(
             f"pupil_mask: got {recipe['pupil_mask']!r}, expected 'auto', 'MASKRND', 'MASKBAR' or "
             "None"
-        )
-    if recipe["crosstalk"] and place.detector != "NRCA5":
-        raise IncompatibleSetupError(
-            f"crosstalk: the embedded kernels are for the detector NRCA5, and "
-            f"{recipe['filter']} is imaged on {place.detector}; use crosstalk=False"
         )
     if recipe["dtype"] not in (torch.float32, torch.float64):
         raise IncompatibleSetupError(
@@ -368,18 +332,13 @@ def _bandpass(recipe: Mapping[str, Any]) -> Bandpass:
 def _detector(place: DetectorPlace, recipe: Mapping[str, Any]) -> Detector:
     scale = to_pair(recipe["pixelscale"] or place.pixelscale, u.arcsec, "pixelscale")
     shape = _field_of_view(recipe["fov_pixels"], recipe["fov_arcsec"], scale)
-    common = (
+    return Detector(
         shape,
         scale,
         recipe["oversample"],
         recipe["dtype"],
         torch.device(recipe["device"]),
         recipe["shear"],
-    )
-    if not recipe["crosstalk"]:
-        return Detector(*common)
-    return ChainDetector(
-        *common, on_pixels=(PixelCrosstalk(_IPC_NRCA5), PixelCrosstalk(_PPC_NRCA5))
     )
 
 
@@ -435,9 +394,7 @@ def _planes(place: DetectorPlace, bandpass: Bandpass, recipe: Mapping[str, Any])
 
 def _internal_coefficients(place: DetectorPlace, si_wfe: bool | ArrayLike, flip: bool) -> Tensor:
     if si_wfe is True:
-        return internal_wavefront_error(
-            place.mask, flip, short_wave=place.short_wave, module=place.module
-        )
+        return internal_wavefront_error(place.mask, flip, short_wave=place.short_wave)
     coefficients = torch.as_tensor(si_wfe, dtype=torch.float64)
     return coefficients if flip else coefficients * parity_in_y(len(coefficients))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import unicodedata
@@ -23,9 +22,6 @@ _SIMBAD = re.compile(r"(V|NAME|\*+)?\*?[\s_-]+", re.IGNORECASE)
 """Prefixes of names in SIMBAD, and of observers after it: V* AU Mic, V-AU-MIC, * bet Pic."""
 
 
-_SLIP_SIMILARITY = 0.6
-"""Least similarity of the digits of two names if one is a slip: one of three digits is wrong."""
-
 _SIGN = re.compile(r"\+(?=\s*\d)")
 """A plus sign before digits, which belongs to the name: BD+20 1790 is not BD-20 1790."""
 
@@ -41,23 +37,11 @@ def same_name(first: str | None, second: str | None) -> bool:
 
 
 def unknown_name(key: str, choice: str, names: Iterable[str | None]) -> IncompatibleSetupError:
-    """Error for a name that is not among the known names, with the name that may be meant."""
+    """Error for a name that is not among the known names."""
     known = sorted({str(name) for name in names})
-    # Another number is another star, however alike the names are.
-    by_plain = {_plain(name): name for name in known if _alike_numbers(choice, name)}
-    nearest = difflib.get_close_matches(_plain(choice), by_plain, n=1, cutoff=0.4)
-    hint = f". Did you mean {by_plain[nearest[0]]!r}?" if nearest else ""
     return IncompatibleSetupError(
-        f"{key}: got {choice!r}, expected one of {', '.join(map(repr, known))}{hint}"
+        f"{key}: got {choice!r}, expected one of {', '.join(map(repr, known))}"
     )
-
-
-def _alike_numbers(first: str, second: str) -> bool:
-    """Whether two names have the same digits but for a slip of the fingers, or one has none."""
-    one, other = ("".join(filter(str.isdigit, name)) for name in (first, second))
-    if not (one and other):
-        return True
-    return difflib.SequenceMatcher(None, one, other).ratio() >= _SLIP_SIMILARITY
 
 
 def _plain(name: str) -> str:
@@ -245,7 +229,7 @@ _DECLARED = (
     Keyword("DRVERS", "version of pyklip_diffrender", "reduce, pyKLIP, psf"),
     Keyword("DRALGO", "star subtraction algorithm", "pyKLIP", "Always `diffrender`."),
     Keyword("DRIMAGE", "image in the products", "pyKLIP",
-            "`cleaned`, `flux` or `subtracted`, see `DiffrenderSettings.image`."),
+            "`cleaned` or `subtracted`, see `DiffrenderSettings.image`."),
     Keyword("DRSTAT", "how the refinement ended", "reduce, pyKLIP",
             "Name of a `Status`, such as `CONVERGED`; of several fits, the status with the "
             "largest chi-squared."),

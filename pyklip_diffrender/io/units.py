@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from collections.abc import Callable
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -83,37 +84,17 @@ def native_float64(value: Any) -> NDArray[np.float64]:
 def _without_unit(value: Any, name: str) -> tuple[NDArray[np.float64], u.UnitBase | None]:
     """Values as float64, NaN where they are masked, and the unit, None if there is none.
 
-    Taken are numbers, sequences, tensors, numpy's and astropy's masked arrays, quantities, columns
-    of tables, `NDData` with `CCDData`, and `StdDevUncertainty`.
+    Taken are numbers, sequences also of quantities, tensors, numpy's and astropy's masked arrays,
+    quantities, and columns of tables.
     """
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
-    if hasattr(value, "uncertainty_type"):
-        return _deviations(value, name)
-    if hasattr(value, "uncertainty") and hasattr(value, "mask"):  # NDData, which is no array.
-        values, unit = _without_unit(value.data, name)
-        if value.mask is not None:
-            values[np.broadcast_to(np.asarray(value.mask) != 0, values.shape)] = np.nan
-        return values, unit if value.unit is None else value.unit
-    if isinstance(value, list | tuple) and any(map(_is_container, value)):
-        members = [_without_unit(member, name) for member in value]
-        units = {None if unit is None else unit.to_string() for _, unit in members}
-        if None in units and units - {None, ""}:
-            raise UnitError(
-                f"{name}: got values with a unit and others without, expected one for each, or none"
-            )
-        unit = members[0][1]
-        try:
-            values = np.array([
-                array if unit is None or other is None else _converted(array, other, unit, name)
-                for array, other in members
-            ])  # fmt: skip
-        except ValueError as error:
-            if isinstance(error, UnitError):
-                raise
-            shapes = ", ".join(dict.fromkeys(str(array.shape) for array, _ in members))
-            raise ShapeError(f"{name}: got members of shapes {shapes}, expected one") from error
-        return values, unit
+    if isinstance(value, list | tuple):
+        value = _of_members(value, name)
+    if hasattr(value, "uncertainty"):  # NDData, of which `numpy.asarray` has no mask and no unit.
+        raise IncompatibleSetupError(
+            f"{name}: got {type(value).__name__}, expected an array: a Quantity, or a masked array"
+        )
     unit = getattr(value, "unit", None) if isinstance(value, np.ndarray) else None
     mask = None
     if isinstance(value, np.ma.MaskedArray):
@@ -140,23 +121,27 @@ def _without_unit(value: Any, name: str) -> tuple[NDArray[np.float64], u.UnitBas
     return values, unit
 
 
-def _is_container(value: Any) -> bool:
-    """Whether `numpy.array` would lose something of a member of a sequence."""
-    if isinstance(value, list | tuple):
-        return any(map(_is_container, value))
-    return isinstance(value, np.ma.MaskedArray | Tensor) or any(
-        hasattr(value, name) for name in ("unit", "unmasked", "uncertainty_type")
-    )
-
-
-def _deviations(value: Any, name: str) -> tuple[NDArray[np.float64], u.UnitBase | None]:
-    """Standard deviations of an `NDUncertainty`."""
-    if value.uncertainty_type != "std":
+def _of_members(value: list[Any] | tuple[Any, ...], name: str) -> Any:
+    """One Quantity of a sequence with units; other sequences of numbers as they are."""
+    if _some(value, lambda each: hasattr(each, "mask")):  # The array would not have it.
         raise IncompatibleSetupError(
-            f"{name}: got {type(value).__name__}, expected standard deviations, such as "
-            "uncertainty.represent_as(StdDevUncertainty)"
+            f"{name}: got a {type(value).__name__} with masked members, expected one masked array"
         )
-    return _without_unit(value.array, name)[0], value.unit
+    if not _some(value, lambda each: getattr(each, "unit", None) is not None):
+        return [each.detach().cpu() if isinstance(each, Tensor) else each for each in value]
+    try:
+        return u.Quantity([u.Quantity(each) for each in value])
+    except (TypeError, u.UnitsError) as error:
+        raise UnitError(
+            f"{name}: got members of different units ({error}), expected one unit for all, or none"
+        ) from error
+    except ValueError as error:
+        raise ShapeError(f"{name}: got members of different shapes ({error})") from error
+
+
+def _some(value: Any, has: Callable[[Any], bool]) -> bool:
+    """Whether a member of a sequence, or of a sequence in it, has something."""
+    return any(_some(v, has) for v in value) if isinstance(value, list | tuple) else has(value)
 
 
 def _converted(

@@ -133,9 +133,10 @@ class OpticalSystem(Propagation):
     def setup(self) -> dict[str, str]:
         """Setup of the instrument; empty if the system is not an instrument.
 
-        The keys "filter", "image_mask", "pupil_mask" and "module" have names as stpsf spells them.
+        The keys "filter", "image_mask" and "pupil_mask", and "module" of stpsf's instruments, have
+        names as stpsf spells them.
         """
-        names = ("filter", "image_mask", "pupil_mask", "module")
+        names = ("filter", "image_mask", "pupil_mask")
         return {name: self.recipe[name] for name in names if self.recipe.get(name)}
 
     @property

@@ -13,8 +13,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -54,9 +53,8 @@ class DiffrenderSettings:
         orientation. There is no default: a reduction without one raises `MissingOPDError`. Of a
         folder of maps, the one closest in time to the frames is taken; see `choose_opd` for other
         rules. "flat" stands for a flat wavefront.
-    model : optical model or mapping, optional
-        Model from `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
-        from the wavelength in ``dataset.wvs`` to a model. Made for the filter if not given.
+    model : optical model, optional
+        Model from `nircam_coronagraph` or a bridge. Made for the filter if not given.
     filter : str, optional
         NIRCam filter, such as ``"F444W"``. Read from the dataset if possible.
     pixelscale : float or (x, y), optional
@@ -96,8 +94,6 @@ class DiffrenderSettings:
         A dataset that has been reduced. The calls reduce copies of it to which faint sources
         were added; the star is not fitted to them again, but what it takes of the sources follows
         from the linear model of the fit. For contrast curves by injection.
-    threads : int, optional
-        Number of threads of a reduction; PyTorch's choice by default. 1 is best on a busy machine.
     (see the options)
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
@@ -140,7 +136,6 @@ class DiffrenderSettings:
     image: Literal["cleaned", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None
-    threads: int | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
 
@@ -161,9 +156,6 @@ class DiffrenderSettings:
                 raise IncompatibleSetupError(
                     f"{name}: got {chosen!r}, expected one of {', '.join(map(str, allowed))}"
                 )
-        threads = self.threads
-        if threads is not None and not (isinstance(threads, int) and threads >= 1):
-            raise IncompatibleSetupError(f"threads: got {threads!r}, expected 1 or more")
         for name, value, kind in (
             ("settings", self.settings, FitSettings),
             ("start", self.start, Mapping),
@@ -238,23 +230,6 @@ def settings_of(dataset: Any) -> DiffrenderSettings:
             f"Set dataset.{ATTRIBUTE} = DiffrenderSettings(opd=...)"
         )
     return own
-
-
-@contextmanager
-def thread_limit(count: int | None) -> Iterator[None]:
-    """Limit PyTorch to a number of threads within a block; None for its own choice."""
-    if count is None:
-        yield
-        return
-    # Takes a second to import.
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:

@@ -1,4 +1,4 @@
-"""The frames of one wavelength of a pyKLIP dataset that a fit gets, by pointing.
+"""The frames of a pyKLIP dataset that a fit gets, by pointing.
 
 Their files are judged as `ExposureSequence` judges files. The fit gets the pixels that the files
 recorded, or the pixels of ``dataset.input``.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,15 +81,9 @@ def admit(source: SourceFrames, frames: NDArray[np.intp], library: Sequence[Path
     not entirely.
     """
     paths = [source.paths[k] for k in frames]
-    sequence = source.sequence
-    known = sequence is not None
-    if sequence is None:
-        sequence = _sequence(source, frames, paths, library)
-    others = {str(each.get("FILTER")) for each in source.headers} - {str(sequence.filter)}
+    sequence = _sequence(source, frames, paths, library)
     for row in sequence.rows:
-        if known and row.use == "excluded":
-            continue  # Whoever has judged the files has said so.
-        if row.remark and row.exposure.filter not in others:
+        if row.remark:
             what = "is not used: " if row.use == "excluded" else ""
             warnings.warn(
                 f"{row.exposure.name}: {what}{row.remark}", DiffrenderWarning, stacklevel=2
@@ -133,12 +127,12 @@ def _sequence(
     )
 
 
-# The frames of one wavelength of a pyKLIP dataset, with the recorded pixels where possible.
+# The frames of a pyKLIP dataset, with the recorded pixels where possible.
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The m of n requested frames, of the target at one wavelength, that have any pixel to fit."""
+    """The m of n requested frames, of the target, that have any pixel to fit."""
 
     observation: Observation
     # (m, ny, nx). Unlike in `observation`, flagged pixels keep their values.
@@ -153,15 +147,12 @@ class Frames:
     pointings: tuple[Pointing, ...] = ()
     # Frames of reference stars in the dataset and the library, by pointing.
     references: tuple[Observation, ...] = ()
-    # (m,), by which the frames of ``dataset.input`` were multiplied since they were read; `data`
-    # and `observation` have the unit of the files.
-    factor: NDArray[np.float64] = field(default_factory=lambda: np.ones(1))
 
     def __repr__(self) -> str:
         return f"<Frames: {self.observation!r}, {len(self.pointings)} pointings>"
 
 
-def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> Observation:
+def observation_from_dataset(dataset: Any) -> Observation:
     """Make an `Observation` of the frames of a pyKLIP dataset.
 
     Parameters
@@ -170,20 +161,18 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
         `JWSTData`, `GenericData` or another one. From a `JWSTData` that was read after
         `register()` the recorded pixels, errors and flags are taken, otherwise the pixels of
         ``dataset.input``. Settings in ``dataset.diffrender`` apply.
-    wavelength : float, optional
-        Selects frames by their value in ``dataset.wvs``; needed if there are several.
 
     Returns
     -------
     Observation
-        All frames of that wavelength, (n, ny, nx).
+        All frames, (n, ny, nx).
 
     Raises
     ------
     NoValidPixelsError
         If there is no frame, or no valid pixel.
     IncompatibleSetupError
-        If the dataset has several wavelengths and none was chosen.
+        If the dataset has several wavelengths.
 
     Warns
     -----
@@ -203,19 +192,7 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
     (2, (16, 16))
     """
     require_frames(dataset)
-    wavelengths = np.unique(dataset.wvs)
-    if wavelength is None:
-        if len(wavelengths) > 1:
-            raise IncompatibleSetupError(
-                f"wavelength: the dataset has {len(wavelengths)} of them ({wavelengths}), choose "
-                "one"
-            )
-        wavelength = wavelengths[0]
-    index = np.flatnonzero(np.asarray(dataset.wvs) == wavelength)
-    if index.size == 0:
-        raise IncompatibleSetupError(f"wavelength: got {wavelength}, the dataset has {wavelengths}")
-    imgs = np.asarray(dataset.input)[index]
-    return _gather(dataset, index, imgs, settings_of(dataset)).observation
+    return _gather(dataset, np.asarray(dataset.input), settings_of(dataset)).observation
 
 
 def date_of_frames(dataset: Any) -> Time | None:
@@ -232,27 +209,32 @@ def date_of_frames(dataset: Any) -> Time | None:
 
 
 def require_frames(dataset: Any) -> None:
-    """Raise `NoValidPixelsError` for a dataset without frames."""
+    """Raise for a dataset without frames, or with frames of several wavelengths."""
     if len(dataset.input) == 0:
         raise NoValidPixelsError("the dataset has no frames; check the list of files it was given")
+    wavelengths = np.unique(dataset.wvs)
+    if len(wavelengths) > 1:
+        raise IncompatibleSetupError(
+            f"dataset.wvs: got {len(wavelengths)} wavelengths ({wavelengths}), expected one. Make "
+            "one dataset for each filter, and reduce them one by one"
+        )
 
 
 def frames_of(
     dataset: Any,
-    index: NDArray[np.intp],
     imgs: NDArray[Any],
     settings: DiffrenderSettings,
     library: Sequence[Path] = (),
 ) -> Frames:
-    """Gather the target's frames of one wavelength with their errors, masks and metadata.
+    """Gather the target's frames with their errors, masks and metadata.
 
-    `imgs` (n, ny, nx) are frames `index` of ``dataset.input``, before any high-pass filter. Frames
-    that `admit` excludes stay NaN in the products. Raises NoValidPixelsError if no frame has a
-    valid pixel.
+    `imgs` (n, ny, nx) are the frames of ``dataset.input``, before any high-pass filter. Frames that
+    `admit` excludes stay NaN in the products. Raises NoValidPixelsError if no frame has a valid
+    pixel.
     """
     # Frames of reference stars may be among the dataset's: all are gathered, then the files judged.
-    every = _gather(dataset, index, imgs, settings)
-    observation, chosen = every.observation, index[every.usable]
+    every = _gather(dataset, imgs, settings)
+    observation, chosen = every.observation, np.flatnonzero(every.usable)
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
     places = None if source is None else source.places(dataset)
     if source is None or places is None:
@@ -284,36 +266,33 @@ def frames_of(
             pointings_of(used, [d for d, yes in zip(details, target, strict=True) if yes])
         ),
         references=references,
-        factor=every.factor[target],
     )
 
 
-def _gather(
-    dataset: Any, index: NDArray[np.intp], imgs: NDArray[Any], settings: DiffrenderSettings
-) -> Frames:
-    """Gather all frames of one wavelength, of whatever star; warns if the files are of no use."""
+def _gather(dataset: Any, imgs: NDArray[Any], settings: DiffrenderSettings) -> Frames:
+    """Gather all frames, of whatever star; warns if the files are of no use."""
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
     recorded: Recorded | None = None
-    centers, pixels, noise = native_float64(dataset.centers)[index], "as given", "ERR"
+    centers, pixels, noise = native_float64(dataset.centers), "as given", "ERR"
     header, unit, pixelscale = fits.Header(), settings.unit, settings.pixelscale
-    factor, lost = np.ones(len(imgs)), why_without_source(dataset)
+    lost = why_without_source(dataset)
     if source is not None:
         places = source.places(dataset)
-        header = source.headers[0 if places is None else places[index[0]]]
+        header = source.headers[0 if places is None else places[0]]
         try:
-            recorded = recorded_frames(source, places, dataset, index, imgs)
+            recorded = recorded_frames(source, places, dataset, imgs)
         except NotRecordedError as reason:
             lost = str(reason)
         if unit is None:
-            stated = header_text(header, "BUNIT", str(dataset.filenames[index[0]]))
+            stated = header_text(header, "BUNIT", str(dataset.filenames[0]))
             unit = u.Unit(stated or "", parse_strict="silent")
         pixelscale = source.pixelscale if pixelscale is None else pixelscale
     if recorded is not None:
-        data, valid, error, centers, factor = recorded
+        data, valid, error, centers = recorded
         pixels = "recorded"
     else:
-        data, error = native_float64(imgs), None
-        valid = np.isfinite(data)
+        data = native_float64(imgs)
+        valid, noise, error = np.isfinite(data), "estimated", _estimate(data)
     if lost is not None:
         warnings.warn(
             f"the errors and original pixels of the files cannot be used: {lost}. The shifted "
@@ -322,19 +301,14 @@ def _gather(
             stacklevel=2,
         )
     if settings.error is not None:
-        # Frames have the unit of the files by now, and given errors the dataset's.
-        error = _broadcast(settings.error, index, dataset.input.shape) / factor[:, None, None]
-        noise = "given"
-    elif error is None:
-        noise, error = "estimated", _estimate(data)
+        noise, error = "given", _broadcast(settings.error, dataset.input.shape)
     with np.errstate(invalid="ignore"):
         valid &= np.isfinite(error) & (error > 0)
 
-    names = [str(name) for name in np.asarray(dataset.filenames)[index]]
+    names = [str(name) for name in dataset.filenames]
     name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
     usable = _usable(valid, name)
-    wavelength = float(np.asarray(dataset.wvs)[index[0]])
-    passband = settings.filter or _filter_name(dataset, header, wavelength)
+    passband = settings.filter or _filter_name(dataset, header, float(dataset.wvs[0]))
     if pixelscale is None:
         known = passband is not None and passband.upper() in FILTERS
         pixelscale = detector_place(None, passband if passband and known else "F444W").pixelscale
@@ -350,12 +324,12 @@ def _gather(
         center=centers[usable],
         filter=passband,
         date=beginning(header, name),
-        position_angles=native_float64(dataset.PAs)[index][usable],
+        position_angles=native_float64(dataset.PAs)[usable],
         name=name,
         header=header,
     )
     mask_unusable(frames)
-    return Frames(Observation(**frames), data, usable, pixels, noise, factor=factor[usable])
+    return Frames(Observation(**frames), data, usable, pixels, noise)
 
 
 def _usable(valid: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:
@@ -374,10 +348,10 @@ def _usable(valid: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:
     return usable
 
 
-def _broadcast(error: Any, index: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _broadcast(error: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     values = native_float64(error)
     try:
-        return np.array(np.broadcast_to(values, shape)[index])
+        return np.array(np.broadcast_to(values, shape))
     except ValueError as reason:
         raise ShapeError(
             f"error: got shape {values.shape}, expected a number, {shape[1:]} or {shape}"

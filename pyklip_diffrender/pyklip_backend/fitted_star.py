@@ -193,7 +193,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Subtraction:
-    """The star in the frames of one wavelength."""
+    """The star in the frames of a dataset."""
 
     # (n, ny, nx), star and uniform background to subtract, in the unit and on the pixels of the
     # observation; NaN outside the model's field.
@@ -230,9 +230,9 @@ class Subtractor(Protocol):
     def __call__(
         self, observation: Observation, opd: OPDMap, settings: DiffrenderSettings
     ) -> Subtraction:
-        """Fit the star in n frames of one wavelength, each with at least one valid pixel.
+        """Fit the star in n frames, each with at least one valid pixel.
 
-        The fit starts from `opd`; `settings.model` is the model for this wavelength. A
+        The fit starts from `opd`. A
         DiffrenderError, if there is no usable result, stops the reduction, which then leaves no
         products.
         """

@@ -35,7 +35,6 @@ from pyklip_diffrender.io.headers import fits_text, fits_unit, set_keyword
 from pyklip_diffrender.pyklip_backend.backend_settings import (
     DiffrenderSettings,
     starting_opd,
-    thread_limit,
 )
 from pyklip_diffrender.pyklip_backend.dataset_frames import (
     Frames,
@@ -181,32 +180,23 @@ def noise_cube(
 
 
 def aligned_before(
-    imgs: NDArray[Any],
-    centers: NDArray[Any],
-    wavelengths: NDArray[Any],
-    center: NDArray[np.float64],
-    dtype: Any,
+    imgs: NDArray[Any], centers: NDArray[Any], center: NDArray[np.float64], dtype: Any
 ) -> NDArray[Any]:
-    """Frames for save_aligned, centred, and scaled to each wavelength: (wavelengths, n, ny, nx)."""
+    """Frames for save_aligned, centred: (1, n, ny, nx), for one wavelength."""
     from pyklip.klip import align_and_scale
 
-    return np.array(
-        [
-            [
-                align_and_scale(img, new_center=center, old_center=old, scale_factor=to / at)
-                for img, old, at in zip(imgs, centers, wavelengths, strict=True)
-            ]
-            for to in np.unique(wavelengths)
-        ],
-        dtype=_number_type(dtype),
-    )
+    frames = [
+        align_and_scale(img, new_center=center, old_center=old)
+        for img, old in zip(imgs, centers, strict=True)
+    ]
+    return np.array([frames], dtype=_number_type(dtype))
 
 
 # Checks that take a second, before minutes of fitting.
 
 
 def check_dataset(dataset: Any) -> None:
-    """Raise for a dataset without frames or without pixels."""
+    """Raise for a dataset without frames or pixels, or with several wavelengths."""
     if np.ndim(dataset.input) != 3:
         raise ShapeError(f"dataset.input: got shape {np.shape(dataset.input)}, expected 3-D")
     require_frames(dataset)
@@ -220,22 +210,10 @@ def check_dataset(dataset: Any) -> None:
 def check_arguments(arguments: Mapping[str, Any]) -> None:
     """Raise for arguments of `klip_dataset` that do not go together."""
     dataset, mode = arguments["dataset"], str(arguments["mode"])
-    if not any(part in mode.upper() for part in ("ADI", "RDI", "SDI")):
+    if not any(part in mode.upper() for part in ("ADI", "RDI")):
         raise IncompatibleSetupError(
-            f"mode: got {mode!r}, expected ADI, RDI, SDI or a sum of them such as 'ADI+RDI'"
-        )
-    if mode.strip().upper() == "SDI" and len(np.unique(dataset.wvs)) == 1:
-        raise IncompatibleSetupError(
-            "mode: 'SDI' compares wavelengths, and this dataset has one. Use mode='ADI', or "
-            "mode='RDI' with a psf_library: the star is rendered, so neither needs references"
-        )
-    wavelengths = np.unique(dataset.wvs)
-    cubes, left_over = divmod(len(dataset.wvs), len(wavelengths))
-    if left_over or not np.array_equal(dataset.wvs, np.tile(wavelengths, cubes)):
-        raise IncompatibleSetupError(
-            f"dataset.wvs: pyKLIP takes frames of {len(wavelengths)} wavelengths for slices of "
-            "spectral cubes, one after the other from the shortest to the longest wavelength. "
-            "These have another order. Make one dataset for each filter, and reduce them one by one"
+            f"mode: got {mode!r}, expected 'ADI', or 'RDI' or 'ADI+RDI' with a psf_library: the "
+            "star is rendered, so none of them needs references"
         )
     if arguments["calibrate_flux"]:
         from pyklip.instruments.Instrument import Data
@@ -256,6 +234,12 @@ def check_arguments(arguments: Mapping[str, Any]) -> None:
 
 _SAME_STAR_PIXELS = 0.01
 """Pixels between the stars in frames and in their copies; centres are single precision."""
+
+
+def is_linear(subtraction: Subtraction) -> bool:
+    """Whether the star is of a single fit that has a linear model."""
+    (first, *others) = subtraction.fits
+    return not others and getattr(first.result, "linear", None) is not None
 
 
 def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
@@ -282,7 +266,7 @@ def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
 
 def _require_copy(record: ReductionRecord, frames: Frames) -> None:
     """Raise for frames that are not copies of the reduced ones with a little light added."""
-    if any(getattr(fit.result, "linear", None) is None for fit in record.subtraction.fits):
+    if not is_linear(record.subtraction):
         raise IncompatibleSetupError(
             "injected_into: its fits have no linear model; reduce it without a `subtractor`"
         )
@@ -306,7 +290,7 @@ def _require_copy(record: ReductionRecord, frames: Frames) -> None:
 _log = logging.getLogger(__name__)
 
 RESULTS = "diffrender_results"
-"""Attribute of the dataset with one `ReductionRecord` per wavelength after a reduction."""
+"""Attribute of the dataset with its `ReductionRecord`, the only one, after a reduction."""
 
 _FILTERED = "_diffrender_filtered"
 
@@ -321,7 +305,7 @@ class DatasetReduction:
         self.arguments = dict(arguments)
         self.dataset = arguments["dataset"]
         self.settings = settings
-        self.records: list[ReductionRecord] = []
+        self.record: ReductionRecord | None = None
         self._unfiltered: NDArray[Any] | None = None
         self._filter: Callable[[NDArray[Any]], NDArray[Any]] | None = None
 
@@ -341,7 +325,7 @@ class DatasetReduction:
             )
             # FITS headers, to which pyKLIP writes them, hold ASCII only.
             self.dataset.filenames = np.array([fits_text(n) for n in self.dataset.filenames])
-            with staging(folder) as stage, thread_limit(self.settings.threads):
+            with staging(folder) as stage:
 
                 def subtract(*args: Any, **kwargs: Any) -> tuple[Any, ...]:
                     subtracted = self._in_place_of_klip(opd, *args, **kwargs)
@@ -354,10 +338,11 @@ class DatasetReduction:
                     high_pass_filter_imgs=self._high_pass,
                 )
                 reduce(**{**self.arguments, "outputdir": str(stage), "fileprefix": prefix})
-                cards = provenance(self.records)
-                self._write_extras(stage, prefix, cards)
+                assert self.record is not None
+                cards = provenance(self.record)
+                self._write_extras(self.record, stage, prefix, cards)
                 calibrated = bool(self.arguments["calibrate_flux"])
-                unit = self.records[0].frames.observation.unit
+                unit = self.record.frames.observation.unit
                 stamp(stage, cards, "" if calibrated else fits_unit(unit))
         except BaseException as error:
             vars(self.dataset).clear()
@@ -365,7 +350,7 @@ class DatasetReduction:
             _say_on_screen(error)
             raise
         self.dataset.filenames = names
-        setattr(self.dataset, RESULTS, tuple(self.records))
+        setattr(self.dataset, RESULTS, (self.record,))
         _log.info("products of %r are in %s", self.arguments["fileprefix"], folder)
 
     def _check(self) -> None:
@@ -373,28 +358,23 @@ class DatasetReduction:
         dataset = self.dataset
         check_dataset(dataset)
         check_arguments(self.arguments)
-        for wave in np.unique(dataset.wvs):
-            self._settings_at(wave)
         if getattr(dataset, _FILTERED, None) is dataset.input:
             raise IncompatibleSetupError(
                 "dataset.input was high-pass filtered by an earlier call of klip_dataset, and a "
                 "star cannot be fitted to filtered frames. Make the dataset again, or give each "
                 "call with highpass=True its own copy.deepcopy(dataset)"
             )
-
-        if self.settings.injected_into is not None:
-            count, expected = len(self._before_injection), len(np.unique(dataset.wvs))
-            if count != expected:
-                raise IncompatibleSetupError(
-                    f"injected_into: it was reduced at {count} wavelengths, and this dataset has "
-                    f"{expected}. Reduce it with algo='diffrender' before sources are added"
-                )
+        if self.settings.injected_into is not None and self._before_injection is None:
+            raise IncompatibleSetupError(
+                "injected_into: it was not reduced. Reduce it with algo='diffrender' before "
+                "sources are added"
+            )
 
     def _opd(self) -> OPDMap:
         """The OPD map to start from."""
         before = self._before_injection
-        if before:
-            return before[0].opd
+        if before is not None:
+            return before.opd
         try:
             return starting_opd(self.settings, date_of_frames(self.dataset))
         except IncompatibleSetupError as error:
@@ -404,9 +384,9 @@ class DatasetReduction:
             raise
 
     @property
-    def _before_injection(self) -> Sequence[ReductionRecord]:
-        """Records of the dataset that this one copies, before faint sources were added."""
-        return getattr(self.settings.injected_into, RESULTS, ())
+    def _before_injection(self) -> ReductionRecord | None:
+        """Record of the dataset that this one copies, before faint sources were added."""
+        return next(iter(getattr(self.settings.injected_into, RESULTS, ())), None)
 
     @property
     def _rdi(self) -> bool:
@@ -462,15 +442,14 @@ class DatasetReduction:
 
         They are sub_imgs (b, n, ny, nx), one equal slice for each of the b entries of numbasis; x,
         y of the common centre; noise, (b, n, ny, nx) if requested, else ``[1.]``; and, if
-        requested, the unsubtracted frames (wavelengths, n, ny, nx).
+        requested, the unsubtracted frames (1, n, ny, nx).
         """
-        index = np.flatnonzero(np.isin(self.dataset.wvs, np.unique(wvs)))
         center = kw.get("aligned_center")
         center = np.mean(centers, axis=0) if center is None else np.asarray(center, dtype=float)
         annuli = annuli_of(
             imgs, centers, IWA, kw.get("OWA"), kw["annuli"], kw.get("annuli_spacing", "constant")
         )
-        unfiltered = imgs if self._unfiltered is None else self._unfiltered[index]
+        unfiltered = imgs if self._unfiltered is None else self._unfiltered
         placed = np.full(imgs.shape, np.nan)
         library = self._reference_files()
         if self._rdi and not library and hasattr(self.dataset, ATTRIBUTE):
@@ -480,18 +459,12 @@ class DatasetReduction:
                 DiffrenderWarning,
                 stacklevel=2,
             )
-        gathered = []
-        # All files are judged before the first fit.
-        for wave in np.unique(wvs):
-            of_wave, settings = np.flatnonzero(wvs == wave), self._settings_at(wave)
-            frames = frames_of(self.dataset, index[of_wave], unfiltered[of_wave], settings, library)
-            gathered.append((of_wave, frames, settings))
-        for of_wave, frames, settings in gathered:
-            residuals = self._subtract(frames, opd, settings)
-            for i, residual, old_center in zip(
-                of_wave[frames.usable], residuals, frames.observation.center, strict=True
-            ):
-                placed[i] = place(residual, old_center, center, annuli)
+        frames = frames_of(self.dataset, unfiltered, self.settings, library)
+        residuals = self._subtract(frames, opd)
+        for i, residual, old_center in zip(
+            np.flatnonzero(frames.usable), residuals, frames.observation.center, strict=True
+        ):
+            placed[i] = place(residual, old_center, center, annuli)
         placed[np.isnan(imgs)] = np.nan
 
         count, dtype = len(np.atleast_1d(kw["numbasis"])), kw.get("dtype")
@@ -500,27 +473,25 @@ class DatasetReduction:
             noise = noise_cube(placed, center, annuli, count, kw.get("numthreads"))
         outputs: tuple[Any, ...] = (slices(placed, count, dtype), list(center), noise)
         if kw.get("save_aligned"):
-            outputs += (aligned_before(imgs, centers, wvs, center, dtype),)
+            outputs += (aligned_before(imgs, centers, center, dtype),)
         return outputs
 
-    def _write_extras(self, stage: Path, prefix: str, cards: fits.Header) -> None:
+    def _write_extras(
+        self, record: ReductionRecord, stage: Path, prefix: str, cards: fits.Header
+    ) -> None:
         """Write what pyKLIP does not: the throughput map, with its median in all products.
 
         Fits without a linear model have no map, and copies with added sources have the original's.
         """
-        if self._before_injection:
-            return
-        # The throughput follows from the linear model of one fit at each wavelength.
-        results = [fit.result for record in self.records for fit in record.subtraction.fits]
-        linear = all(getattr(result, "linear", None) is not None for result in results)
-        if not linear or len(results) != len(self.records):
+        if self._before_injection is not None or not is_linear(record.subtraction):
             return
         self._tell("throughput of faint sources")
+        (fit,) = record.subtraction.fits
         median = write_throughput(
             stage / f"{prefix}-throughput.fits",
             self.dataset,
-            list(map(self._throughput, self.records, results)),
-            [result.frames[0].observation for result in results],
+            self._throughput(record, fit.result),
+            fit.result.frames[0].observation,
             is_turned=not self.arguments["skip_derot"],
         )
         set_keyword(cards, "DRTHRU", median)
@@ -535,29 +506,12 @@ class DatasetReduction:
         """Return which image the products carry."""
         return image_of(self.settings, subtraction)
 
-    def _settings_at(self, wave: float) -> DiffrenderSettings:
-        """The settings with the model for this wavelength."""
-        model = self.settings.model
-        if not isinstance(model, Mapping):
-            if model is not None and len(np.unique(self.dataset.wvs)) > 1:
-                raise IncompatibleSetupError(
-                    f"model: the dataset has wavelengths {np.unique(self.dataset.wvs)} and one "
-                    "model was given. Give a mapping from wavelength to model"
-                )
-            return self.settings
-        for key, value in model.items():
-            if np.isclose(float(key), wave, rtol=1e-6, atol=0.0):
-                return dataclasses.replace(self.settings, model=value)
-        raise IncompatibleSetupError(f"model: none for wavelength {wave}, only for {list(model)}")
-
-    def _subtract(
-        self, frames: Frames, opd: OPDMap, settings: DiffrenderSettings
-    ) -> NDArray[np.float64]:
-        """Frames minus star, (m, ny, nx) in ``dataset.input``'s unit, filtered if asked for."""
-        observation = frames.observation
+    def _subtract(self, frames: Frames, opd: OPDMap) -> NDArray[np.float64]:
+        """Frames minus star, (m, ny, nx), filtered if asked for."""
+        observation, settings = frames.observation, self.settings
         before = self._before_injection
-        if before:
-            subtraction = subtract_from_copy(before[len(self.records)], frames)
+        if before is not None:
+            subtraction = subtract_from_copy(before, frames)
         elif settings.subtractor is not None:
             subtraction = settings.subtractor(observation, opd, settings)
         else:
@@ -583,16 +537,13 @@ class DatasetReduction:
             )
         filled = sum(map(fill, residuals, observation.valid))
         image = self._image(subtraction)
-        record = ReductionRecord(frames, opd, subtraction, filled, image)
+        self.record = ReductionRecord(frames, opd, subtraction, filled, image)
         if image != "subtracted":
             self._tell(f"image of the products: {image}")
             # The model of the sky is the fit's, also for copies with added sources.
-            original = before[len(self.records)] if before else record
-            added = frames.data - original.frames.data if before else None
+            original = self.record if before is None else before
+            added = None if before is None else frames.data - before.frames.data
             original.images.put_into(residuals, added)
-        self.records.append(record)
-        # The fit has the unit of the files; whoever multiplied the dataset gets it multiplied.
-        residuals *= frames.factor[:, np.newaxis, np.newaxis]
         if self._filter is not None:
             residuals = np.array([self._filter(residual) for residual in residuals])
         return residuals
@@ -635,7 +586,9 @@ class ForwardReduction(DatasetReduction):
     def _verbose(self) -> bool:
         return not self.arguments["mute_progression"]
 
-    def _write_extras(self, stage: Path, prefix: str, cards: fits.Header) -> None:
+    def _write_extras(
+        self, record: ReductionRecord, stage: Path, prefix: str, cards: fits.Header
+    ) -> None:
         """Add what the fit says of the planet; the forward model says how much is left of it."""
         cards.extend(self._planet_cards)
 
@@ -694,37 +647,32 @@ class ForwardReduction(DatasetReduction):
 
         self._tell("forward model of the planet")
         images, taken = np.full(shape, np.nan), np.full(shape[0], np.nan)
-        for record, wave in zip(self.records, np.unique(wvs), strict=True):
-            frames = np.flatnonzero(wvs == wave)[record.frames.usable]
-            planets = planet_in_frames(
-                self.fm_class,
-                record.subtraction.pointings,
-                frames,
-                parangs[frames],
-                wave,
-                flipx,
-                self._filter,
-            )
-            # The cards are of one flux and position, so of one wavelength.
-            if len(self.records) == 1:
-                first = next(part for part in record.subtraction.pointings if part.index == 0)
-                k, reduction = int(first.pointing.frames[0]), record.subtraction.reduction
-                self._planet_cards = planet_cards(
-                    first,
-                    dataclasses.replace(
-                        planets[k], contrast=planets[k].contrast / record.frames.factor[k]
-                    ),
-                    parangs[frames[k]],
-                    flipx,
-                    None if reduction is None else reduction.detection.error_factor,
-                )
-            for k, planet in planets.items():
-                fill(planet.left, record.frames.observation.valid[k])
-                image = planet.left if self._filter is None else self._filter(planet.left)
-                images[frames[k]] = align_and_scale(
-                    image, new_center=center, old_center=planet.center
-                )
-                taken[frames[k]] = planet.taken
+        record = self.record
+        assert record is not None
+        frames = np.flatnonzero(record.frames.usable)
+        planets = planet_in_frames(
+            self.fm_class,
+            record.subtraction.pointings,
+            frames,
+            parangs[frames],
+            wvs[0],
+            flipx,
+            self._filter,
+        )
+        first = next(part for part in record.subtraction.pointings if part.index == 0)
+        k, reduction = int(first.pointing.frames[0]), record.subtraction.reduction
+        self._planet_cards = planet_cards(
+            first,
+            planets[k],
+            parangs[frames[k]],
+            flipx,
+            None if reduction is None else reduction.detection.error_factor,
+        )
+        for k, planet in planets.items():
+            fill(planet.left, record.frames.observation.valid[k])
+            image = planet.left if self._filter is None else self._filter(planet.left)
+            images[frames[k]] = align_and_scale(image, new_center=center, old_center=planet.center)
+            taken[frames[k]] = planet.taken
         return images, taken
 
 

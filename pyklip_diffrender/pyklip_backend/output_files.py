@@ -6,7 +6,7 @@ import math
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -274,32 +274,25 @@ def on_product(
 def write_throughput(
     path: Path,
     dataset: Any,
-    maps: Sequence[NDArray[np.float64]],
-    frames: Sequence[Observation],
+    image: NDArray[np.float64],
+    frame: Observation,
     *,
     is_turned: bool,
 ) -> float:
-    """Write maps of the throughput on the products' pixels, and return the fitted pixels' median.
+    """Write a map of the throughput on the products' pixels, and return the fitted pixels' median.
 
-    `maps` (ny, nx), one for every wavelength, are on the pixels of the first frames, which are
-    `frames`. With `is_turned` pyKLIP has turned north up.
+    The map, `image` (ny, nx), is on the pixels of the first `frame`. With `is_turned` pyKLIP has
+    turned north up.
     """
-    turned = []
     center = np.asarray(dataset.output_centers[0], dtype=float)
-    for k, (image, frame) in enumerate(zip(maps, frames, strict=True)):
-        angle = frame.position_angle if is_turned else 0.0
-        shape = dataset.output.shape[-2:]
-        each = on_product(image, frame.center[0], shape, center, angle, dataset.flipx)
-        # Three kinds of pixels: NaN outside the fitted square, where nothing is taken and the
-        # throughput is 1; inf, so NaN in the file, where the product has no value; and the
-        # pixels of the median.
-        each[np.isnan(dataset.output[0, :, k]).all(axis=0)] = np.inf
-        turned.append(each)
-    cube = np.array(turned)
-    median = float(np.median(cube[np.isfinite(cube)]))
-    cube = np.where(np.isnan(cube), 1.0, np.where(np.isinf(cube), np.nan, cube))
-    cube = cube[0] if len(cube) == 1 else cube
-    hdu = fits.PrimaryHDU(cube.astype(np.float32))
+    angle = frame.position_angle if is_turned else 0.0
+    shape = dataset.output.shape[-2:]
+    turned = on_product(image, frame.center[0], shape, center, angle, dataset.flipx)
+    # NaN are pixels outside the fitted square, where nothing is taken and the throughput is 1.
+    shown = ~np.isnan(dataset.output[0, :, 0]).all(axis=0)
+    median = float(np.median(turned[shown & np.isfinite(turned)]))
+    turned = np.where(shown, np.nan_to_num(turned, nan=1.0), np.nan)
+    hdu = fits.PrimaryHDU(turned.astype(np.float32))
     hdu.header["BUNIT"] = ("", "fraction of a faint point source's peak")
     hdu.header["PSFCENTX"], hdu.header["PSFCENTY"] = center
     hdu.header["STARCENX"], hdu.header["STARCENY"] = center[0] + 1, center[1] + 1
@@ -319,7 +312,7 @@ def write_throughput(
 
 @dataclass(frozen=True, eq=False)
 class ReductionRecord:
-    """How the frames of one wavelength were reduced."""
+    """How the frames of a dataset were reduced."""
 
     frames: Frames
     opd: OPDMap  # at the start of the fit
@@ -387,40 +380,37 @@ _SLICES = "as asked for; all slices are one image"
 """Comments on cards of KLIP's parameters and modes."""
 
 
-def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
-    """Cards for a product made from these wavelengths: keywords, then HISTORY.
+def provenance(record: ReductionRecord) -> fits.Header:
+    """Cards for a product: keywords, then HISTORY.
 
-    A keyword has the value that all fits share; chi2 and status are the worst fit's. HISTORY has
-    all.
+    Where there are several fits, chi2 and status are the worst fit's, and HISTORY has all.
     """
-    fits_of_all = [fit for record in records for fit in record.subtraction.fits]
-    worst = max(fits_of_all, key=lambda fit: fit.chi2)
-    first = records[0]
-    companions = max(record.subtraction.kept for record in records)
+    frames, subtraction, opd = record.frames, record.subtraction, record.opd
+    passband = frames.observation.filter
     header = fits.Header()
     values: dict[str, Any] = {
         "DRALGO": "diffrender",
         "DRVERS": __version__,
-        "DROPD": first.opd.name,
-        "DRSHA256": first.opd.sha256,
-        "DRFILT": _shared(r.frames.observation.filter or "" for r in records),
-        "DRSTAT": worst.status,
-        "DRCHI2": worst.chi2,
-        "DRNFIT": len(fits_of_all),
-        "DRKEPT": companions,
-        "DRPATTRN": _shared(r.subtraction.pattern for r in records),
-        "DRREFS": sum(r.subtraction.references for r in records),
-        "DRREFUSE": _shared(_use_of_references(r.subtraction) for r in records),
-        "DRPIXELS": _shared(r.frames.pixels for r in records),
-        "DRFILLED": sum(r.filled for r in records),
-        "DRIMAGE": _shared(r.image for r in records),
-        "DRNOISE": _shared(r.frames.noise for r in records),
+        "DROPD": opd.name,
+        "DRSHA256": opd.sha256,
+        "DRFILT": passband or "",
+        "DRSTAT": subtraction.worst.status,
+        "DRCHI2": subtraction.worst.chi2,
+        "DRNFIT": len(subtraction.fits),
+        "DRKEPT": subtraction.kept,
+        "DRPATTRN": subtraction.pattern,
+        "DRREFS": subtraction.references,
+        "DRREFUSE": _use_of_references(subtraction),
+        "DRPIXELS": frames.pixels,
+        "DRFILLED": record.filled,
+        "DRIMAGE": record.image,
+        "DRNOISE": frames.noise,
     }
-    dates = [pointing.observation.date for pointing in first.frames.pointings]
+    dates = [pointing.observation.date for pointing in frames.pointings]
     known = [date for date in dates if date is not None]
-    days = first.opd.days_after(Time(known).mean()) if known else None
-    if first.opd.date is not None:
-        values["DROPDDAT"] = first.opd.date.isot
+    days = opd.days_after(Time(known).mean()) if known else None
+    if opd.date is not None:
+        values["DROPDDAT"] = opd.date.isot
     if days is not None:
         values["DROPDHRS"] = 24 * days
     for key, value in values.items():
@@ -431,21 +421,19 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         "of annuli are not used"
     )
     header.add_history("DRSHA256 is the SHA-256 of the OPD map's file, or of its array")
-    for record in records:
-        frames, subtraction = record.frames, record.subtraction
-        line = (
-            f"diffrender: {frames.observation.name}, {frames.observation.filter or 'given model'}, "
-            f"opd {record.opd.name}, "
-            f"{frames.pixels} pixels, errors {frames.noise}"
+    line = (
+        f"diffrender: {frames.observation.name}, {passband or 'given model'}, "
+        f"opd {opd.name}, "
+        f"{frames.pixels} pixels, errors {frames.noise}"
+    )
+    header.add_history(fits_text(line))
+    for fit in subtraction.fits:
+        header.add_history(
+            f"diffrender: frames {', '.join(map(str, fit.frames))}: {fit.status}, "
+            f"chi2/N {fit.chi2:.4g}"
         )
-        header.add_history(fits_text(line))
-        for fit in subtraction.fits:
-            header.add_history(
-                f"diffrender: frames {', '.join(map(str, fit.frames))}: {fit.status}, "
-                f"chi2/N {fit.chi2:.4g}"
-            )
-        for line in _fitted(subtraction):
-            header.add_history(f"diffrender: {line}")
+    for line in _fitted(subtraction):
+        header.add_history(f"diffrender: {line}")
     return header
 
 
@@ -485,7 +473,3 @@ def stamp(folder: Path, cards: fits.Header, unit: str) -> None:
             for key in header:
                 if key == "PSFPARAM" or key.startswith("KLMODE"):
                     header.comments[key] = _PARAMETERS if key == "PSFPARAM" else _SLICES
-
-
-def _shared(values: Iterable[str]) -> str:
-    return ", ".join(dict.fromkeys(values))

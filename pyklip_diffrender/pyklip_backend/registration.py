@@ -6,26 +6,22 @@ import contextlib
 import logging
 import os
 import threading
-import warnings
-import weakref
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.backend_settings import (
     DiffrenderSettings,
     OPDLike,
     settings_of,
 )
 from pyklip_diffrender.pyklip_backend.klip_call import (
-    RESULTS,
     DatasetReduction,
     ForwardReduction,
     mark_filtered,
 )
-from pyklip_diffrender.pyklip_backend.output_files import ReductionRecord
 from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 from pyklip_diffrender.pyklip_backend.source_frames import keeping_references, keeping_source
 
@@ -35,16 +31,6 @@ ALGORITHM = "diffrender"
 """Value of the argument `algo` of `klip_dataset`."""
 
 
-class Patched(Protocol):
-    """The functions of pyKLIP that are changed while the backend is in use."""
-
-    klip_dataset: PatchedFunction
-    fm_klip_dataset: PatchedFunction
-
-    def restore(self) -> None:
-        """Undo the changes."""
-
-
 class Registry:
     """The users of the backend, and the settings given to `register`."""
 
@@ -52,13 +38,13 @@ class Registry:
         # For changes of the others.
         self.lock = threading.RLock()
         # None while nobody uses the backend.
-        self.patches: Patched | None = None
+        self.patches: Patches | None = None
         self.registered = False
         # Number of `backend` blocks in all threads.
         self.blocks = 0
         self.defaults = DiffrenderSettings()
-        # Whether `register` was told to take over KLIP; None if it was told nothing.
-        self.replace: bool | None = None
+        # Whether `register` was told to take over KLIP.
+        self.replace = False
 
 
 REGISTRY = Registry()
@@ -66,37 +52,14 @@ REGISTRY = Registry()
 BLOCK: ContextVar[tuple[DiffrenderSettings, bool | None]] = ContextVar(
     "diffrender", default=(DiffrenderSettings(), None)
 )
-"""Settings of the enclosing `backend` blocks, and whether they take over KLIP; None without."""
-
-_warned: weakref.WeakSet[ReductionRecord] = weakref.WeakSet()
-"""Reductions whose dataset, or a copy of it, was given to KLIP with a warning."""
-
-
-def _takes_klip() -> bool | None:
-    """Whether calls with ``algo="klip"`` are for this backend; None if nobody has said so."""
-    _, force = BLOCK.get()
-    return REGISTRY.replace if force is None else force
+"""Settings of the enclosing `backend` blocks, and whether they take over KLIP; None outside."""
 
 
 def is_ours(algo: Any) -> bool:
     """Whether a call with this `algo` is for this backend."""
-    name = str(algo).lower()
-    return name == ALGORITHM or (name == "klip" and bool(_takes_klip()))
-
-
-def warn_of_klip(dataset: Any, function: str) -> None:
-    """Warn if KLIP runs on a dataset that this backend has reduced."""
-    records = getattr(dataset, RESULTS, ())
-    if not records or records[0] in _warned or _takes_klip() is not None:
-        return
-    _warned.add(records[0])
-    warnings.warn(
-        f"{function} runs KLIP on a dataset that was reduced with algo='diffrender' before. "
-        "register(replace=True) or `with backend():` redirects calls of klip_dataset that ask for "
-        "algo='klip'; register(replace=False) runs KLIP without this warning",
-        DiffrenderWarning,
-        stacklevel=4,
-    )
+    _, force = BLOCK.get()
+    takes_klip = REGISTRY.replace if force is None else force
+    return str(algo).lower() in (ALGORITHM, *(["klip"] if takes_klip else []))
 
 
 def settings_for(dataset: Any) -> DiffrenderSettings:
@@ -150,7 +113,7 @@ class Patches:
             patch.restore()
 
 
-def _patches() -> Patched:
+def _patches() -> Patches:
     """The patches that led to the present call; another thread may just have removed them."""
     patches = REGISTRY.patches
     if patches is None:
@@ -173,8 +136,6 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
         settings = settings_for(arguments["dataset"])
         DatasetReduction(arguments, settings).run(klip_dataset.original)
     else:
-        if str(arguments["algo"]).lower() == "klip":
-            warn_of_klip(arguments["dataset"], "klip_dataset")
         klip_dataset.original()(*args, **kwargs)
     if arguments["highpass"] not in (False, None):
         mark_filtered(arguments["dataset"])
@@ -184,7 +145,6 @@ def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
     """Handle a call of `pyklip.fm.klip_dataset`, to which this package adds an argument `algo`."""
     klip_dataset = _patches().fm_klip_dataset
     if not is_ours(kwargs.get("algo", "klip")):
-        warn_of_klip(args[0] if args else kwargs.get("dataset"), "pyklip.fm.klip_dataset")
         return klip_dataset.original()(*args, **kwargs)
     kwargs.pop("algo", None)
     call = klip_dataset.signature.bind(*args, **kwargs)
@@ -246,9 +206,8 @@ def register(
     model : optical model, optional
         Default model; if not given, one is made for the dataset's filter.
     replace : bool, optional
-        True takes over calls with ``algo="klip"`` as well, for code that hard-codes it. With False
-        they run KLIP. By default they run KLIP too, with a warning if the same dataset was reduced
-        by this backend before.
+        True takes over calls with ``algo="klip"`` as well, for code that hard-codes it. With False,
+        as at first, they run KLIP.
     **options
         Other fields of `DiffrenderSettings`.
 
@@ -285,13 +244,12 @@ def unregister() -> None:
     """
     with REGISTRY.lock:
         REGISTRY.defaults = DiffrenderSettings()
-        REGISTRY.replace = None
+        REGISTRY.replace = False
         _use(False, REGISTRY.blocks)
 
 
 @contextlib.contextmanager
 def backend(
-    name: str = ALGORITHM,
     *,
     opd: OPDLike | None = None,
     model: Any = None,
@@ -306,8 +264,6 @@ def backend(
 
     Parameters
     ----------
-    name : str
-        Only "diffrender".
     opd, model, **options
         As for `register`; they take precedence over the dataset's and `register`'s.
     force : bool
@@ -317,7 +273,7 @@ def backend(
     Raises
     ------
     IncompatibleSetupError
-        For an unknown name, or if pyKLIP is not as expected.
+        If pyKLIP is not as expected.
 
     Examples
     --------
@@ -326,8 +282,6 @@ def backend(
     >>> with dr.pyklip_backend.backend(opd="opd.fits"):  # doctest: +SKIP
     ...     klip_dataset(dataset, mode="ADI+RDI", psf_library=library)
     """
-    if name != ALGORITHM:
-        raise IncompatibleSetupError(f"name: got {name!r}, the only backend is {ALGORITHM!r}")
     outer, _ = BLOCK.get()
     settings = DiffrenderSettings(opd=opd, model=model, **options).over(outer)
     with REGISTRY.lock:

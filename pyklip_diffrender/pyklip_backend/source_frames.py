@@ -9,11 +9,7 @@ orientation are a `Pointing`.
 
 from __future__ import annotations
 
-import logging
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +18,6 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, NoValidPixelsError
 from pyklip_diffrender.io.files import open_fits, read_image
 from pyklip_diffrender.io.headers import fits_text, header_number, merged_header
 from pyklip_diffrender.io.units import native_float64
@@ -30,11 +25,8 @@ from pyklip_diffrender.scene.aligned_frames import SHIFTS
 from pyklip_diffrender.scene.exposure import beginning, middle
 from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.integrations import pointings
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, single_precision, unflagged
+from pyklip_diffrender.scene.jwst_files import single_precision, unflagged
 from pyklip_diffrender.scene.observation import Observation, frames_in
-from pyklip_diffrender.scene.sequence import ExposureSequence
-
-_log = logging.getLogger(__name__)
 
 ATTRIBUTE = "_diffrender_source"
 """Attribute of the dataset that holds its `SourceFrames`."""
@@ -65,7 +57,7 @@ class SourceFrames:
     # (N, ny, nx), before resampling; NaN where the flags say NON_SCIENCE.
     data: NDArray[np.floating[Any]]
     # (N, ny, nx), standard deviations from ERR in the unit of `data`.
-    error: NDArray[np.floating[Any]] | None
+    error: NDArray[np.floating[Any]]
     # (N, ny, nx), False where a flag excludes the pixel from the fit.
     usable: NDArray[np.bool_]
     # (N, 2), x, y of the star in `data`, 0-indexed.
@@ -83,8 +75,6 @@ class SourceFrames:
     # The file of every frame.
     paths: list[Path]
     files: dict[Path, FrameFile]
-    # What the files were sorted into, if they were judged before pyKLIP read them.
-    sequence: ExposureSequence | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
         """Itself: it never changes, so copies of a dataset can share it."""
@@ -149,35 +139,31 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
     from pyklip.klip import align_and_scale
 
     paths = [filepaths] if isinstance(filepaths, str) else list(filepaths)
-    files: list[_File] = []
-    first = np.empty(0)
-    for path in paths:
-        file, as_read, center = _read(path, dataset)
-        if not files:
-            middle = (np.array(as_read.shape[:0:-1]) - 1) / 2.0
-            first = align_and_scale(as_read[0], new_center=middle, old_center=center)
-        files.append(file)
-    counts = [len(file.data) for file in files]
-    judged = _JUDGED_FILES.get()
+    files = [_File.read(Path(path).absolute(), dataset) for path in paths]
+    counts = [len(file.frames.data) for file in files]
+    first = files[0]
+    middle = (np.array(first.as_read.shape[::-1]) - 1) / 2.0
+    shifted = align_and_scale(first.as_read, new_center=middle, old_center=first.center)
+
+    def repeated(values: Iterable[Any]) -> list[Any]:
+        return [value for value, n in zip(values, counts, strict=True) for _ in range(n)]
+
     source = SourceFrames(
-        headers=[file.header for file, n in zip(files, counts, strict=True) for _ in range(n)],
-        data=_joined([file.data for file in files]),
-        error=None
-        if any(file.error is None for file in files)
-        else _joined([file.error for file in files if file.error is not None]),
-        usable=_joined([file.usable for file in files]),
-        centers=np.concatenate([file.centers for file in files]),
+        headers=repeated(each.header for each in files),
+        data=_joined([each.frames.data for each in files]),
+        error=_joined([each.frames.error for each in files]),
+        usable=_joined([each.frames.valid for each in files]),
+        centers=np.concatenate([each.centers for each in files]),
         aligned=np.array(dataset.input),
         aligned_centers=np.array(dataset.centers),
         filenames=tuple(str(name) for name in dataset.filenames),
-        first_pixels=[f.first_pixel for f, n in zip(files, counts, strict=True) for _ in range(n)],
-        star_offsets=[f.star_offset for f, n in zip(files, counts, strict=True) for _ in range(n)],
-        paths=[f.file.path for f, n in zip(files, counts, strict=True) for _ in range(n)],
+        first_pixels=repeated(each.frames.first_pixel for each in files),
+        star_offsets=repeated(each.frames.star_offset for each in files),
+        paths=repeated(each.file.path for each in files),
         files={each.file.path: each.file for each in files},
-        sequence=None if judged is None else judged.sequence,
     )
     same_shape = source.data.shape == source.aligned.shape
-    if not same_shape or not _is_close(first, source.aligned[0]):
+    if not same_shape or not _is_close(shifted, source.aligned[0]):
         raise ValueError(f"{paths[0]}: pyKLIP shifted these frames in a way not known here")
     return source
 
@@ -198,146 +184,47 @@ class _File(NamedTuple):
 
     file: FrameFile
     header: fits.Header
-    data: NDArray[np.floating[Any]]
-    error: NDArray[np.floating[Any]] | None
-    usable: NDArray[np.bool_]
+    frames: Observation  # all integrations, as in `SourceFrames`
     centers: NDArray[np.float64]
-    first_pixel: tuple[int, int] | None
-    star_offset: tuple[float, float] | None
-
-
-class OpenedFile(NamedTuple):
-    """Contents of a file, for `reduce` and as pyKLIP reads it.
-
-    Attributes
-    ----------
-    file : FrameFile
-    primary, science : Header
-    as_read : ndarray, (N, ny, nx)
-        The pixels as pyKLIP reads them.
-    usable : ndarray of bool, (N, ny, nx)
-        Where no flag excludes them from the fit.
-    frames : Observation or DiffrenderError or None
-        All integrations, with the pixels and errors of `SourceFrames`, or why they cannot be read;
-        None for a file without frames.
-    aligned : bool
-        Whether the file has shifts, which were undone in `frames`.
-    """
-
-    file: FrameFile
-    primary: fits.Header
-    science: fits.Header
-    as_read: NDArray[np.floating[Any]]
-    usable: NDArray[np.bool_]
-    frames: Observation | DiffrenderError | None
-    aligned: bool
+    as_read: NDArray[np.floating[Any]]  # (ny, nx), the first one as pyKLIP reads it
+    center: NDArray[np.float64]  # (2,), and its star
 
     @classmethod
-    def at(cls, path: str | os.PathLike[str]) -> OpenedFile:
-        """Open a file, once, and read it plane by plane; KeyError without a SCI extension."""
-        where = Path(path).absolute()
-        with open_fits(where, images=False) as hdus:
-            file = FrameFile.in_hdus(hdus, where)
-            science = hdus["SCI"]
-            if not science.is_image:
-                raise CorruptFileError(f"{where.name}: SCI is a table, not an image")
-            aligned = any(name in hdus for name in SHIFTS)
-            frames = None
-            if not file.is_product:
-                frames, means = _every_integration(hdus, where)
-                file = replace(file, frames=means)
-            single = science.header["BITPIX"] == -32
-            as_read = read_image(science, where, single_precision if single else native_float64)
+    def read(cls, path: Path, dataset: Any) -> _File:
+        """Read a file, plane by plane, as `reduce` does; KeyError without a SCI extension."""
+        with open_fits(path, images=False) as hdus:
+            file = FrameFile.in_hdus(hdus, path)
+            primary, science = hdus[0].header, hdus["SCI"].header
+            frames = Observation(**frames_in(hdus, path, every_integration=True, compact=True))
+            single = science["BITPIX"] == -32
+            as_read = read_image(hdus["SCI"], path, single_precision if single else native_float64)
             as_read = as_read[np.newaxis] if as_read.ndim == 2 else as_read
-            as_read[~_without_flags(hdus, where, NON_SCIENCE, as_read.shape)] = np.nan
-            if isinstance(frames, Observation):
-                usable = frames.valid
-                # The gaps of frames that are put back are where they were before the shift.
-                frames.data[~(usable if aligned else np.isfinite(as_read))] = np.nan
-                frames.error[~usable] = 0.0
-            else:
-                usable = _without_flags(hdus, where, BAD_PIXEL_BITS, as_read.shape)
-            return cls(file, hdus[0].header, science.header, as_read, usable, frames, aligned)
-
-
-def _every_integration(
-    hdus: fits.HDUList, path: Path
-) -> tuple[Observation | DiffrenderError, Observation | DiffrenderError]:
-    """All integrations of an open file, and their means; or why there are none."""
-    try:
-        frames = Observation(**frames_in(hdus, path, every_integration=True, compact=True))
-        return frames, frames.means()
-    except DiffrenderError as error:
-        return error, error
-
-
-def _without_flags(
-    hdus: fits.HDUList, path: Path, bits: int, shape: tuple[int, ...]
-) -> NDArray[np.bool_]:
-    """Pixels of an open file without one of these flags, (N, ny, nx)."""
-    if "DQ" not in hdus:
-        return np.ones(shape, dtype=bool)
-    good = read_image(hdus["DQ"], path, lambda flags: unflagged(flags, path.name, bits))
-    return np.broadcast_to(good, shape)
-
-
-class JudgedFiles(NamedTuple):
-    """Files that were opened and judged before pyKLIP reads them, by path."""
-
-    files: Mapping[Path, OpenedFile]
-    sequence: ExposureSequence
-
-
-_JUDGED_FILES: ContextVar[JudgedFiles | None] = ContextVar("judged", default=None)
-
-
-@contextmanager
-def judged_before(files: JudgedFiles) -> Iterator[None]:
-    """Take files that were opened already for datasets that are read inside."""
-    token = _JUDGED_FILES.set(files)
-    try:
-        yield
-    finally:
-        _JUDGED_FILES.reset(token)
-
-
-def _read(path: str, dataset: Any) -> tuple[_File, NDArray[np.floating[Any]], NDArray[np.float64]]:
-    """Read one file as `reduce` does, and its pixels, (N, ny, nx), and star, (2,), as pyKLIP."""
-    judged = _JUDGED_FILES.get()
-    known = None if judged is None else judged.files.get(Path(path).absolute())
-    file, primary, science, as_read, usable, frames, aligned = known or OpenedFile.at(path)
-    header = merged_header(primary, science, path)
-    # As pyKLIP finds the centre: the given keywords, else CRPIX, plus the dither if requested.
-    keywords = (dataset.center_kw_x, "CRPIX1"), (dataset.center_kw_y, "CRPIX2")
-    center = np.array([science.get(key, science.get(other)) - 1 for key, other in keywords], float)
-    if dataset.center_include_offset:
-        offset = np.array([primary["XOFFSET"], primary["YOFFSET"]])
-        center += offset / np.sqrt(science["PIXAR_A2"])
-    centers = np.tile(center, (len(as_read), 1))
-    if isinstance(frames, CorruptFileError | NoValidPixelsError):
-        # Such as a file without errors, or a frame whose pixels are all flagged.
-        _log.warning("only the pixels and flags are used: %s", frames)
-        return _File(file, header, as_read, None, usable, centers, None, None), as_read, center
-    if not isinstance(frames, Observation):
-        raise frames or CorruptFileError(f"{path}: no frames")
-    if aligned:
-        # Frames are back on the pixels of the detector, so that flat-field errors are, too.
-        stated = [
-            header_number(header, key if key in header else other, file.name)
-            for key, other in (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
-        ]
-        centers += frames.center - (np.array(stated, dtype=float) - 1)
-    read = _File(
-        file,
-        header,
-        frames.data,
-        frames.error,
-        usable,
-        centers,
-        frames.first_pixel,
-        frames.star_offset,
-    )
-    return read, as_read, center
+            if "DQ" in hdus:
+                good = read_image(
+                    hdus["DQ"], path, lambda flags: unflagged(flags, path.name, NON_SCIENCE)
+                )
+                as_read[~np.broadcast_to(good, as_read.shape)] = np.nan
+        file = replace(file, frames=frames.means())
+        aligned = any(name in hdus for name in SHIFTS)
+        # The gaps of frames that are put back are where they were before the shift.
+        frames.data[~(frames.valid if aligned else np.isfinite(as_read))] = np.nan
+        frames.error[~frames.valid] = 0.0
+        header = merged_header(primary, science, path.name)
+        # As pyKLIP finds the centre: the given keywords, else CRPIX, plus the dither if requested.
+        keywords = (dataset.center_kw_x, "CRPIX1"), (dataset.center_kw_y, "CRPIX2")
+        center = np.array([science.get(key, science.get(crpix)) - 1 for key, crpix in keywords])
+        if dataset.center_include_offset:
+            offset = np.array([primary["XOFFSET"], primary["YOFFSET"]])
+            center = center + offset / np.sqrt(science["PIXAR_A2"])
+        centers = np.tile(center.astype(float), (len(as_read), 1))
+        if aligned:
+            # Frames are back on the pixels of the detector, so that flat-field errors are, too.
+            stated = [
+                header_number(header, key if key in header else crpix, file.name)
+                for key, crpix in (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
+            ]
+            centers += frames.center - (np.array(stated, dtype=float) - 1)
+        return cls(file, header, frames, centers, as_read[0].copy(), center)
 
 
 def keeping_references(readpsflib: Callable[..., None]) -> Callable[..., None]:
@@ -373,23 +260,21 @@ class Recorded(NamedTuple):
 
     data: NDArray[np.float64]
     valid: NDArray[np.bool_]
-    error: NDArray[np.float64] | None
+    error: NDArray[np.float64]
     centers: NDArray[np.float64]  # (n, 2), x, y
-    factor: NDArray[np.float64]  # (n,), of the dataset's frames over the recorded ones
 
 
 def recorded_frames(
     source: SourceFrames,
     places: NDArray[np.intp] | None,
     dataset: Any,
-    index: NDArray[np.intp],
     imgs: NDArray[Any],
 ) -> Recorded:
-    """Recorded pixels plus what was added to `imgs` (n, ny, nx) since reading, in the files' unit.
+    """Recorded pixels plus what was added to `imgs` (n, ny, nx) since reading.
 
-    Frame by frame, so that the changes of all frames are not in memory at once. `index` and
-    `places` (n,) say where the frames are in the dataset and, of all its frames, in `source`.
-    Raises NotRecordedError if no recorded pixels correspond to the dataset's.
+    Frame by frame, so that the changes of all frames are not in memory at once. `places` (n,) say
+    where the frames are in `source`. Raises NotRecordedError if no recorded pixels correspond to
+    the dataset's.
     """
     from pyklip.klip import align_and_scale
 
@@ -401,26 +286,21 @@ def recorded_frames(
             f"its frames have {imgs.shape[2]} x {imgs.shape[1]} pixels, and had {nx} x {ny} when "
             "they were read"
         )
-    # pyKLIP's frames are now = factor * (S recorded + added), where S shifts the star to the middle
-    # of the array. So added = now / factor - S recorded, and the fit takes recorded + S^-1 added,
-    # where S^-1 shifts it back: only what was added has been interpolated, and not the noise.
-    rows = places[index]
-    data = native_float64(source.data[rows])
-    error = None if source.error is None else native_float64(source.error[rows])
-    valid = source.usable[rows] & np.isfinite(data)
-    centers, factors = native_float64(dataset.centers)[index], np.ones(len(rows))
-    moved = centers - source.aligned_centers[rows]
-    for i, frame in enumerate(rows):
+    # pyKLIP's frames are now = S recorded + added, where S shifts the star to the middle of the
+    # array. So added = now - S recorded, and the fit takes recorded + S^-1 added, where S^-1 shifts
+    # it back: only what was added has been interpolated, and not the noise.
+    data = native_float64(source.data[places])
+    error = native_float64(source.error[places])
+    valid = source.usable[places] & np.isfinite(data)
+    moved = native_float64(dataset.centers) - source.aligned_centers[places]
+    for i, frame in enumerate(places):
         now, before = native_float64(imgs[i]), native_float64(source.aligned[frame])
-        factors[i] = _factor(now, before)
         # Pixels that were NaN when they were read belong to flagged ones, whatever was filled in.
-        change = np.where(np.isfinite(before), now / factors[i] - before, 0.0)
-        if error is not None:
-            _require_same(change, error[i], source.usable[frame])
+        change = np.where(np.isfinite(before), now - before, 0.0)
+        _require_same(change, error[i], source.usable[frame])
         shift = {"new_center": source.centers[frame], "old_center": source.aligned_centers[frame]}
         masked = np.isnan(now) & np.isfinite(before)
         added = np.where(np.isfinite(change), change, 0.0)
-        # A changed factor is known to the rounding of single precision.
         peak = np.max(np.abs(before), where=np.isfinite(before), initial=0.0)
         if np.abs(added).max() > _SINGLE_PRECISION_ERROR * peak:
             # Nothing is known beyond the edge of the shifted frame; assume nothing was added.
@@ -428,33 +308,7 @@ def recorded_frames(
         if masked.any():
             # A pixel masked by hand invalidates every recorded pixel that contributed to it.
             valid[i] &= np.nan_to_num(align_and_scale(masked.astype(float), **shift)) < 0.1
-    return Recorded(data, valid, error, source.centers[rows] + moved, factors)
-
-
-def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
-    """Factor by which a frame (ny, nx) was multiplied since it was read; 1 if it was not.
-
-    Raises NotRecordedError if it is not positive.
-    """
-    known = np.isfinite(before) & np.isfinite(now)
-    if not known.any():
-        return 1.0
-    with np.errstate(invalid="ignore"):
-        bright = known & (np.abs(before) > np.percentile(np.abs(before[known]), 90))
-    if not bright.any():
-        return 1.0
-    # A frame that was only multiplied has one ratio in all its brightest pixels, to the rounding of
-    # single precision. Where the ratios scatter by more, something else was done to it.
-    ratios = now[bright] / before[bright]
-    factor = float(np.median(ratios))
-    # Sources that were added since change few of the brightest pixels.
-    if abs(factor - 1) < _SINGLE_PRECISION_ERROR or np.median(
-        np.abs(ratios - factor)
-    ) > _SINGLE_PRECISION_ERROR * abs(factor):
-        return 1.0
-    if factor <= 0:
-        raise NotRecordedError(f"its frames were multiplied by {factor:.3g} after reading")
-    return factor
+    return Recorded(data, valid, error, source.centers[places] + moved)
 
 
 def _require_same(

@@ -181,7 +181,8 @@ def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
         ("filter", setup.get("filter"), observation.filter),
         ("image mask", setup.get("image_mask"), header_text(header, "CORONMSK", name)),
         ("pupil mask", setup.get("pupil_mask"), header_text(header, "PUPIL", name)),
-        ("module", setup.get("module"), module_of(header, name)),
+        # `nircam_coronagraph` is of module A.
+        ("module", setup.get("module", "A") if setup else None, module_of(header, name)),
     )
     for aspect, expected, actual in setups:
         if not isinstance(expected, str) or not isinstance(actual, str):

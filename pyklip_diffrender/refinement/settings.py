@@ -17,7 +17,7 @@ from pyklip_diffrender.instrument.masks import stop_is_measured
 from pyklip_diffrender.io.units import ARCSEC, half_circle, require_positive, to_bytes, to_unit
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
-from pyklip_diffrender.scene.exposure import image_mask, module_of
+from pyklip_diffrender.scene.exposure import image_mask
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import pupil_samples
@@ -364,7 +364,6 @@ class FitSettings:
         *,
         reach: int = _FITTED_REACH_PIXELS,
         image_mask: str | None = None,
-        module: str | None = None,
         **changes: Any,
     ) -> FitSettings:
         """Return the settings for real NIRCam frames, for which the model is not exact.
@@ -389,10 +388,9 @@ class FitSettings:
             the edge of the square that `reduce` fits, with 18 cycles in F444W and F210M, 22 in
             F356W and 32 in F250M.
         image_mask : str, optional
-            Image mask; default a round mask.
-        module : "A" or "B", optional
-            Default A. In B, in the short-wave channel and behind bars, the alignment of the Lyot
-            stop was not measured in flight, and its prior is three times as wide.
+            Image mask; default a round mask. Behind bars, and in the short-wave channel, the
+            alignment of the Lyot stop was not measured in flight, and its prior is three times as
+            wide.
         **changes
             Fields with other values.
 
@@ -409,7 +407,7 @@ class FitSettings:
         """
         wavelength = _wavelength("F444W" if filter is None else filter)
         short = wavelength <= _LONG_WAVE_FROM_M
-        loose = 1.0 if stop_is_measured(image_mask, short, module) else 3.0
+        loose = 1.0 if stop_is_measured(image_mask, short) else 3.0
         preset = cls(
             free=(
                 "star_offset",
@@ -511,12 +509,9 @@ def quick_settings(observation: Observation) -> FitSettings:
 
 
 def nircam_settings(observation: Observation, **changes: Any) -> FitSettings:
-    """Return the preset `FitSettings.nircam` for an observation's filter, mask and module."""
-    header, name = observation.header, observation.name
-    mask = image_mask(header, name)
-    return FitSettings.nircam(
-        observation.filter, image_mask=mask, module=module_of(header, name), **changes
-    )
+    """Return the preset `FitSettings.nircam` for an observation's filter and mask."""
+    mask = image_mask(observation.header, observation.name)
+    return FitSettings.nircam(observation.filter, image_mask=mask, **changes)
 
 
 def _wavelength(filter: str) -> float:

@@ -21,7 +21,7 @@ from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
 from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.pixel_checks import copies, why_other_brightness, why_turned
+from pyklip_diffrender.scene.pixel_checks import why_other_brightness, why_turned
 
 EPOCH = 5.0
 """Days between frames that may share an OPD map."""
@@ -191,10 +191,7 @@ def _why_unusable(exposure: Exposure) -> str:
 
 
 def _moment(file: FrameFile) -> tuple[object, ...] | None:
-    """Identity, roll and time, which files of one exposure share; None if they are not known.
-
-    Copies whose headers were given another roll or date count as other exposures.
-    """
+    """Identity, roll and time, which files of one exposure share; None if they are not known."""
     exposure = file.exposure
     if exposure.identity is None:
         return None
@@ -465,14 +462,6 @@ def unoriented(science: Sequence[FrameFile]) -> Reasons:
             "Add the cards",
         )
     return reasons
-
-
-def copied(files: Sequence[FrameFile]) -> Reasons:
-    """Frames with the pixels of another file, whatever the headers say."""
-    return {
-        files[k]: f"it has the pixels of {files[j].name}: a copy of the exposure"
-        for k, j in copies(_frames(files)).items()
-    }
 
 
 def turned(files: Sequence[FrameFile]) -> Reasons:

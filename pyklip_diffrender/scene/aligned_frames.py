@@ -20,7 +20,7 @@ from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.headers import header_number, header_text
 from pyklip_diffrender.io.units import native_float64, require_finite
 from pyklip_diffrender.optics.convolution import fft_convolve
-from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask, module_of
+from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask
 from pyklip_diffrender.scene.star_place import measured_offset
 
 _log = logging.getLogger(__name__)
@@ -105,10 +105,10 @@ def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
     """Place of the mask's centre on the whole detector, x, y in pixels from 0, (2,).
 
     The place follows from DETECTOR, FILTER, and the mask in CORONMSK, APERNAME or SUBARRAY. None if
-    the header does not say, or if the place was not measured, as in module B.
+    the header does not say, or if the place was not measured.
     """
     detector, mask = detector_of(header, name), image_mask(header, name)
-    if detector is None or mask is None or module_of(header, name) == "B":
+    if detector is None or mask is None:
         return None
     try:
         passband = header_text(header, "FILTER", name) or ""

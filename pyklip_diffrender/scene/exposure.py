@@ -6,11 +6,10 @@ No card has a default here: a value that is not stated is None.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from astropy import units as u
@@ -285,9 +284,6 @@ def common_motion(headers: Iterable[tuple[fits.Header, str]]) -> tuple[float, fl
 _MASK = re.compile(r"(?<![A-Z0-9])(?:SUB\d+|MASK)?[AB]?(?:MASK)?(\d{3}R|LWB|SWB)(?![A-Z0-9])")
 """A mask in CORONMSK (MASKA335R), APERNAME (NRCA5_MASK335R) or SUBARRAY (SUB320A335R)."""
 
-_MODULE = re.compile(r"(?:NRC|MASK|SUB\d+)?([AB])(?=\d|[LS]WB|LONG|$)")
-"""NIRCam's module in a detector (NRCALONG), MODULE (A), CORONMSK or SUBARRAY."""
-
 _SAME_ANGLE_DEG = 0.1
 """Degrees by which the sum of two angles may differ from the sum in a card."""
 
@@ -380,32 +376,23 @@ def image_mask(header: fits.Header, name: str) -> str | None:
         elif key == "CORONMSK" and text:
             # Masks of other instruments, or none.
             stated[key] = text
-    return _agreed(stated, header, "masks", name)
-
-
-def _agreed(
-    stated: Mapping[str, str], texts: Mapping[str, Any], aspect: str, name: str
-) -> str | None:
-    """The value that all cards state, or None; raise an exception if they differ."""
     if len(set(stated.values())) > 1:
-        listed = ", ".join(f"{key} {texts[key]}" for key in stated)
+        listed = ", ".join(f"{key} {header[key]}" for key in stated)
         raise CorruptFileError(
-            f"{name}: {listed}: the cards name different {aspect}. Correct the header, or fetch "
-            "the file again"
+            f"{name}: {listed}: the cards name different masks. Correct the header, or fetch the "
+            "file again"
         )
     return next(iter(stated.values()), None)
 
 
 def module_of(header: fits.Header, name: str) -> str | None:
-    """NIRCam's module, "A" or "B", from the detector, MODULE, CORONMSK or SUBARRAY.
+    """NIRCam's module, "A" or "B", from the detector or MODULE; "B" if one of them says so.
 
-    None where the header does not say; CorruptFileError if two of the cards differ.
+    None where the header does not say.
     """
-    texts = {key: header_text(header, key, name) for key in ("MODULE", "CORONMSK", "SUBARRAY")}
-    texts = {"DETECTOR": detector_of(header, name), **texts}
-    matches = {key: _MODULE.match((text or "").upper()) for key, text in texts.items()}
-    stated = {key: match[1] for key, match in matches.items() if match}
-    return _agreed(stated, texts, "modules", name)
+    detector, stated = detector_of(header, name), header_text(header, "MODULE", name)
+    letters = ((detector or "")[3:4], (stated or "").upper())
+    return next((module for module in "BA" if module in letters), None)
 
 
 def bar_place(header: fits.Header, name: str) -> str | None:

@@ -23,7 +23,6 @@ from pyklip_diffrender.io.files import read_image
 from pyklip_diffrender.io.headers import card_error, header_number, header_text, merged_header
 from pyklip_diffrender.io.units import ARCSEC, native_float64
 from pyklip_diffrender.scene.aligned_frames import (
-    SAME_PLACE_PIXELS,
     SHIFTS,
     first_pixel,
     recorded_shifts,
@@ -51,9 +50,9 @@ _PIXEL_SCALES_ARCSEC = (0.031, 0.063)
 
 
 def _checked_place(
-    star: tuple[float, float], stated: Any, shape: tuple[int, ...], name: str
+    star: tuple[float, float], shape: tuple[int, ...], name: str
 ) -> NDArray[np.float64]:
-    """The place of a star, x, y from 0, which is inside the frame; `stated` is the header's."""
+    """The place of a star, x, y from 0, which is inside the frame."""
     place = np.array(star, dtype=float)
     (ny, nx), (x, y) = shape, place
     if not (-0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5):
@@ -61,14 +60,6 @@ def _checked_place(
             f"{name}: star: got x, y = {x:g}, {y:g}, expected a place in its {nx} x {ny} pixels, "
             "counted from 0"
         )
-    if (
-        stated is not None
-        and np.abs(place - 1 - np.reshape(stated, (-1, 2))).max() < SAME_PLACE_PIXELS
-    ):
-        _log.warning(
-            "%s: star: got x, y = %g, %g, which is where the header has it, but counted from 1; "
-            "expected pixels from 0, %g, %g", name, x, y, x - 1, y - 1
-        )  # fmt: skip
     return place
 
 
@@ -116,7 +107,7 @@ def read_calints(
     mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
     details = _details(header, 1 if data.ndim == 2 else len(data), name)
     if star is not None:
-        details["center"] = _checked_place(star, details["center"], data.shape[-2:], name)
+        details["center"] = _checked_place(star, data.shape[-2:], name)
     frames = data.reshape(-1, *data.shape[-2:]).shape
     shifts = recorded_shifts(hdus, np.asarray(details["center"], float), frames, name)
     # A star whose position is stated was moved, unless the file has shifts not yet applied.

@@ -97,17 +97,6 @@ class Window:
 _log = logging.getLogger(__name__)
 
 
-def frames_of_file(
-    path: str | os.PathLike[str],
-    *,
-    every_integration: bool,
-    star: tuple[float, float] | None = None,
-) -> dict[str, Any]:
-    """Read and judge a calints file: the attributes of `Observation.from_fits`."""
-    with open_fits(path, images=False) as hdus:
-        return frames_in(hdus, path, every_integration=every_integration, star=star)
-
-
 def frames_in(
     hdus: fits.HDUList,
     path: str | os.PathLike[str],
@@ -116,7 +105,7 @@ def frames_in(
     compact: bool = False,
     star: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
-    """Read and judge the calints file at that path, which is open, see `frames_of_file`.
+    """Read and judge the calints file at that path, which is open: attributes as of `from_fits`.
 
     `compact` keeps pixels and errors in single precision if the file does.
     """
@@ -132,22 +121,14 @@ def frames_in(
     return frames
 
 
-def means_of_file(
-    path: str | os.PathLike[str], *, star: tuple[float, float] | None = None
-) -> dict[str, Any]:
-    """Read and judge a calints file: the attributes of the means of each of its pointings.
-
-    Reading takes at most as much memory as the file has, however many integrations there are; see
-    `Observation.means_from_fits`.
-    """
-    with open_fits(path, images=False) as hdus:
-        return means_in(hdus, path, star=star)
-
-
 def means_in(
     hdus: fits.HDUList, path: str | os.PathLike[str], *, star: tuple[float, float] | None = None
 ) -> dict[str, Any]:
-    """Read, judge and average the calints file at that path, which is open, see `means_of_file`."""
+    """Read, judge and average the calints file at that path, which is open.
+
+    The result has the attributes of the means of each of its pointings. Reading takes at most as
+    much memory as the file has, however many integrations there are.
+    """
     frames, kept, _ = _judged(hdus, path, compact=True, star=star)
     return frames | means_of_pointings(frames, np.flatnonzero(kept))
 
@@ -394,7 +375,8 @@ class Observation:
         ShapeError, NoValidPixelsError
             As `from_arrays`.
         """
-        return cls(**frames_of_file(path, every_integration=every_integration, star=star))
+        with open_fits(path, images=False) as hdus:
+            return cls(**frames_in(hdus, path, every_integration=every_integration, star=star))
 
     @classmethod
     def means_from_hdus(cls, hdus: fits.HDUList, path: str | os.PathLike[str]) -> Observation:
@@ -428,7 +410,8 @@ class Observation:
         CorruptFileError, UnitError, ShapeError, NoValidPixelsError
             As `from_fits`.
         """
-        return cls(**means_of_file(path, star=star))
+        with open_fits(path, images=False) as hdus:
+            return cls(**means_in(hdus, path, star=star))
 
     def means(self) -> Observation:
         """Average the frames of each pointing, without frames that have no valid pixel.

@@ -68,16 +68,8 @@ _BRIGHTNESS_RATIO = 1.5
 """Ratio of brightness between frames of one star that has another cause than the star's position
 behind the mask. The ratio of rolls was at most 1.05 for the real stars at hand."""
 
-_COPY = 0.95
-"""Correlation of two frames' noise above which they are one frame. Flat-field errors correlate the
-frames of different stars by up to 0.6."""
-
-_SAME_NOISE_SIGMAS = 0.3
-"""Median difference of two frames, in standard deviations, below which their noise is the same: 1.1
-for two exposures."""
-
 _FEWEST_PIXELS = 2000
-"""Least number of pixels for a correlation or a scatter."""
+"""Least number of pixels for a scatter."""
 
 _NOISE_FROM_ARCSEC = 3.0
 """arcsec from the star beyond which pixels show mostly noise."""
@@ -372,7 +364,7 @@ def why_odd_unit(observation: Observation) -> str:
 
     Only frames in MJy/sr with 2000 pixels far from the star are judged.
     """
-    difference, usable = _noise(observation, clipped=False)
+    difference, usable = _noise(observation)
     if usable.sum() < _FEWEST_PIXELS or observation.unit != u.MJy / u.sr:
         return ""
     dark = dark_pixels(_mean(observation)[0], usable)
@@ -386,45 +378,6 @@ def why_odd_unit(observation: Observation) -> str:
         f"MJy/sr, expected {low:g} to {high:g}. BUNIT is probably wrong, the pixels were "
         "multiplied by a factor, or a crowded field or a nebula leaves no dark part of the frame"
     )
-
-
-def copies(observations: Sequence[Observation]) -> dict[int, int]:
-    """Find observations with the pixels of an earlier one: index of the copy, and of the other.
-
-    Frames with fewer than 2000 pixels far from the star are not compared.
-    """
-    # Pixels far from the star are compared, whatever the headers say, so that copies in another
-    # unit, or with a few other pixels, are seen as such. Exposures of one bright field are alike,
-    # too, but differ by their noise.
-    noise = [_noise(each) for each in observations]
-    result: dict[int, int] = {}
-    for k, (values, usable) in enumerate(noise):
-        for j in range(k):
-            others, too = noise[j]
-            if j in result or others.shape != values.shape:
-                continue
-            both = usable & too
-            if both.sum() < _FEWEST_PIXELS:
-                continue
-            if np.corrcoef(values[both], others[both])[0, 1] > _COPY and not _differ_by_noise(
-                observations[k], observations[j], both
-            ):
-                result[k] = j
-                break
-    return result
-
-
-def _differ_by_noise(
-    observation: Observation, other: Observation, usable: NDArray[np.bool_]
-) -> bool:
-    """Whether two frames differ by as much as their errors say, up to a factor."""
-    (data, error, _), (others, _, _) = _mean(observation), _mean(other)
-    rough = [each - convolve(each, _NEIGHBOURS, mode="nearest") for each in (data, others)]
-    mine, theirs = (each[usable] for each in rough)
-    # The factor a, of another unit, that makes sum of (mine - a theirs)^2 minimal.
-    factor = float((mine * theirs).sum() / (theirs**2).sum())
-    # Of two exposures the noise of the difference is 1.6 times the error of one.
-    return float(np.median(np.abs(mine - factor * theirs) / error[usable])) > _SAME_NOISE_SIGMAS
 
 
 def _mean(observation: Observation) -> tuple[Image, Image, NDArray[np.bool_]]:
@@ -447,12 +400,8 @@ def _stamp(observation: Observation) -> tuple[Image, Image, Image] | None:
     )
 
 
-def _noise(observation: Observation, *, clipped: bool = True) -> tuple[Image, NDArray[np.bool_]]:
-    """Differences from neighbouring pixels, clipped, and which of them are far from the star."""
+def _noise(observation: Observation) -> tuple[Image, NDArray[np.bool_]]:
+    """Differences from neighbouring pixels, and which of them are far from the star."""
     data, _, valid = _mean(observation)
     difference = data - convolve(data, _NEIGHBOURS, mode="nearest")
-    usable = valid & (_distance(observation) > _NOISE_FROM_ARCSEC)
-    typical = float(np.median(np.abs(difference[usable]))) if usable.any() else 0.0
-    if typical > 0 and clipped:
-        difference = np.clip(difference / typical, -6, 6)
-    return difference, usable
+    return difference, valid & (_distance(observation) > _NOISE_FROM_ARCSEC)

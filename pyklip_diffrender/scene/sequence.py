@@ -21,7 +21,6 @@ from pyklip_diffrender.scene.admission import (
     admitted,
     choose_filter,
     choose_target,
-    copied,
     epochs_of,
     exposures_in,
     of_other_brightness,
@@ -348,7 +347,6 @@ class ExposureSequence:
         # Only frames that can be used vote for the set-up.
         admission.apply(with_odd_pixels, together)
         admission.apply(of_other_setups, science, references)
-        admission.apply(copied, together)
         admission.apply(turned, together)
         for group in (science, *others):
             admission.apply(of_other_brightness, group)

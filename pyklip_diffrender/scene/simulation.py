@@ -47,8 +47,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     """Make the model of the coronagraph for an observation.
 
     Frames whose header says NIRCam get the detector's scale and shear from the SIAF, and the Lyot
-    stop in its place in flight, or in its nominal place if that was not measured (short wave, bars
-    and module B). A fit starts from this model. A model that was made before is used again.
+    stop in its place in flight, or in its nominal place if that was not measured (short wave and
+    bars). A fit starts from this model. A model that was made before is used again.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         "pixelscale": observation.pixelscale,
     }
     if observation.is_nircam:
-        place = _place_of(observation, overrides.get("image_mask"), overrides.get("module"))
+        place = _place_of(observation, overrides.get("image_mask"))
         # The star may be rendered in the whole field of the mask as well.
         shape = observation.shape
         if size is not None:
@@ -112,7 +112,6 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             shape = max(ny, size), max(nx, size)
         arguments |= {
             "image_mask": place.mask,
-            "module": place.module,
             "bar_place": place.place,
             "pixelscale": place.siaf_pixelscale,
             "shear": place.siaf_shear,
@@ -120,7 +119,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             "npix": pupil_samples(observation, shape, _PUPIL_SAMPLES, place),
             "occulter_sampling": _CELLS_PER_LAMBDA_D,
             "defaults": FLIGHT_ALIGNMENT
-            if stop_is_measured(place.mask, place.short_wave, place.module)
+            if stop_is_measured(place.mask, place.short_wave)
             else None,
         }
     arguments |= overrides
@@ -132,9 +131,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         return _model(observation.filter, items, tuple((defaults or {}).items()))
 
 
-def _place_of(
-    observation: Observation, mask: str | None = None, module: str | None = None
-) -> DetectorPlace:
+def _place_of(observation: Observation, mask: str | None = None) -> DetectorPlace:
     """Place of the star in a frame of NIRCam, behind the mask in its header or another mask.
 
     IncompatibleSetupError if the header does not say, or what it says is not modelled.
@@ -152,12 +149,13 @@ def _place_of(
             f"{', '.join(MASKS)}"
         )
     along = bar_place(observation.header, observation.name)
-    module = module or module_of(observation.header, observation.name) or "A"
-    place = detector_place(name, str(observation.filter), along, module)
+    place = detector_place(name, str(observation.filter), along)
     detector = detector_of(observation.header, observation.name)
-    if detector not in (None, place.header_detector):
+    module = module_of(observation.header, observation.name)
+    if module == "B" or detector not in (None, place.header_detector):
+        what = "module B" if detector is None else f"the detector {detector}"
         raise IncompatibleSetupError(
-            f"{observation.name}: these frames are of the detector {detector}, expected "
+            f"{observation.name}: these frames are of {what}, expected "
             f"{place.header_detector}, on which {name} is imaged in {observation.filter}"
         )
     return place

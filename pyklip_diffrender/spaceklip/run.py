@@ -15,7 +15,6 @@ from astropy.table import Table
 
 from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.errors import (
-    CorruptFileError,
     DiffrenderError,
     DiffrenderWarning,
     IncompatibleSetupError,
@@ -24,7 +23,6 @@ from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.headers import file_name
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
-from pyklip_diffrender.pyklip_backend.source_frames import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.reduction import SPECTRA, by_star, in_words, search_together
 from pyklip_diffrender.refinement import to_jansky
 from pyklip_diffrender.scene.frame_file import FrameFile
@@ -159,7 +157,7 @@ def run_obs(
     products: dict[str, Path] = {}
     detections: dict[str, Detection] = {}
     failures: list[Exception] = []
-    admitted: dict[str, tuple[Table, JudgedFiles]] = {}
+    admitted: dict[str, tuple[Table, ExposureSequence]] = {}
     for key, table in database.obs.items():
         if restrict_to is not None and restrict_to not in key:
             continue
@@ -172,14 +170,13 @@ def run_obs(
         except DiffrenderError as error:
             error.add_note(f"concatenation {key}")
             failures.append(error)
-    for key in list(admitted):
-        table, judged = admitted.pop(key)
+    for key, (table, sequence) in admitted.items():
         logger.info("concatenation %s", key)
         try:
             products[key], detections[key] = _reduced(
                 key,
                 table,
-                judged,
+                sequence,
                 folder,
                 save_rolls,
                 {**common, "verbose": verbose, "star_flux": fluxes.get(_filter(table))},
@@ -262,33 +259,27 @@ def why_unsupported(table: Table) -> str | None:
     return None
 
 
-def _admitted(key: str, table: Table) -> tuple[Table, JudgedFiles]:
-    """Rows of a concatenation whose files are used, and the files, which are opened once.
+def _admitted(key: str, table: Table) -> tuple[Table, ExposureSequence]:
+    """Rows of a concatenation whose files are used, and what all files were sorted into.
 
     Raises as `ExposureSequence.from_files`, and warns of every file that is left out.
     """
     paths = [Path(str(path)).absolute() for path in table["FITSFILE"]]
-    opened: dict[Path, OpenedFile] = {}
     listed: dict[bool, list[FrameFile]] = {True: [], False: []}
     for path, kind in zip(paths, table["TYPE"], strict=True):
-        try:
-            opened[path] = OpenedFile.at(path)
-            file = opened[path].file
-        except (CorruptFileError, KeyError):
-            file = FrameFile.opened(path)  # It says what is wrong.
-        listed[str(kind) == "SCI"].append(file)
+        listed[str(kind) == "SCI"].append(FrameFile.opened(path, lambda exposure: True))
     sequence = ExposureSequence.of_opened(listed[True], listed[False])
     for name, reason in sequence.excluded:
         warnings.warn(f"{key}: {name} is left out: {reason}", DiffrenderWarning, stacklevel=3)
     used = {row.path for row in sequence.rows if row.use != "excluded"}
     chosen = np.array([path in used for path in paths])
-    return table[chosen], JudgedFiles(opened, sequence)
+    return table[chosen], sequence
 
 
 def _reduced(
     key: str,
     table: Table,
-    judged: JudgedFiles,
+    sequence: ExposureSequence,
     folder: Path,
     save_rolls: bool,
     settings: dict[str, Any],
@@ -298,10 +289,9 @@ def _reduced(
     files = np.array(table["FITSFILE"], dtype=object)
     mode = "ADI+RDI" if (kinds == "REF").any() else "ADI"
     prefix = f"{mode}_NANNU1_NSUBS1_{key}"
-    with judged_before(judged):
-        dataset = reduce_jwst_files(
-            files[kinds == "SCI"], files[kinds == "REF"], folder=folder, prefix=prefix, **settings
-        )
+    dataset = reduce_jwst_files(
+        files[kinds == "SCI"], files[kinds == "REF"], folder=folder, prefix=prefix, **settings
+    )
     # A concatenation has one filter, so one wavelength.
     (record,) = dataset.diffrender_results
     detection = record.subtraction.reduction.detection
@@ -316,9 +306,7 @@ def _reduced(
     source_table(detection, product).write(
         folder / f"{prefix}-results.ecsv", format="ascii.ecsv", overwrite=True
     )
-    judged.sequence.table.write(
-        folder / f"{prefix}-frames.ecsv", format="ascii.ecsv", overwrite=True
-    )
+    sequence.table.write(folder / f"{prefix}-frames.ecsv", format="ascii.ecsv", overwrite=True)
     write_database(folder / f"{key}.dat", table)
     write_mask(folder / f"{key}_psfmask.fits", table)
     return product, detection
