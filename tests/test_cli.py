@@ -206,7 +206,7 @@ def test_frames_by_an_association_or_a_pattern(frames, reducing, capsys, name):
     assert ("two_calints" in out) == (name == "x_asn.json")
 
 
-def test_a_dry_run_lists_frames_and_map_and_writes_nothing(tmp_path, reducing, capsys):
+def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(tmp_path, reducing, capsys):
     arguments = [*reducing, "--dry-run"]
     assert main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -215,6 +215,9 @@ def test_a_dry_run_lists_frames_and_map_and_writes_nothing(tmp_path, reducing, c
     assert any(line.startswith("left out: three_calints.fits: ") for line in lines)
     sensed = "opd_2022-07-31.fits, sensed 2022-07-31T00:00, 0.9 days after the frames"
     assert f"OPD map: {sensed}" in lines
+    assert lines[-4:] == [
+        "1. wavefront", "2. reference stars and target together", "3. search", "4. products",
+    ]  # fmt: skip
     assert not (tmp_path / "products").exists()
     # Which is which follows from the option, too.
     assert main([*arguments, "--target", "HIP-2"]) == 0

@@ -10,6 +10,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.cli.reducing import describe_steps
 from pyklip_diffrender.detection import sources_of_references
 from pyklip_diffrender.detection.error_factor import structures_in_single_roll
 from pyklip_diffrender.pattern import (
@@ -273,23 +274,29 @@ def test_a_pattern_is_not_learned_twice_from_a_reference():
     assert pattern_for_visit(replace(choice, origin="none"), science()[:1], elsewhere) is None
 
 
+TEACHING, TOGETHER = "reference star HD 2", "reference stars and target together"
+
+
 @pytest.mark.parametrize(
-    ("near", "far", "options", "teaching", "joining"),
+    ("near", "far", "options", "planned", "alone"),
     [
-        (3, 0, {}, 0, 3),
-        (1, 2, {}, 2, 1),
-        (1, 2, {"pattern": "references"}, 3, 1),
-        (1, 2, {"disk": True}, 3, 0),
-        (1, 2, {"references": "off"}, 0, 0),
-        (1, 1, {"references": "pattern"}, 2, 0),
+        (3, 0, {}, [TOGETHER], 0),
+        (1, 0, {}, [TOGETHER], 0),
+        (1, 2, {}, [TEACHING, TOGETHER], 0),
+        (3, 2, {}, [TEACHING, TOGETHER], 0),
+        (0, 2, {"references": "off"}, [], 2),
+        (0, 2, {"pattern": "off"}, [], 2),
+        (1, 1, {"references": "pattern"}, [TEACHING], 0),
     ],
 )
-def test_what_reference_frames_are_used_for(near, far, options, teaching, joining):
+def test_a_plan_has_what_reference_frames_are_used_for(near, far, options, planned, alone):
     references = (*(reference(k) for k in range(near)), *(later(k) for k in range(far)))
     sequence = dr.ExposureSequence("HD 1", science(), references)
-    options = ReduceOptions(size=SIZE, **options)
-    assert len(pipeline.frames_for_pattern(sequence, options)) == teaching
-    assert len(pipeline.frames_in_likelihood(sequence, options)) == joining
+    steps = describe_steps(sequence, ReduceOptions(size=SIZE, **options)).splitlines()
+    names = [each.partition(". ")[2] for each in steps]
+    assert [name for name in names if name in (TEACHING, TOGETHER)] == planned
+    only = f", with {alone} reference frame{'' if alone == 1 else 's'} for KLIP only"
+    assert names[-1] == f"products{only if alone else ''}"
 
 
 FLAT_FIELD = "jwst_nircam_flat_0001.fits"

@@ -20,6 +20,12 @@ from pyklip_diffrender.instrument.spectrum import star_flux_density
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.options import Accuracy, ReduceOptions
+from pyklip_diffrender.pattern import (
+    PatternLibrary,
+    combine_libraries,
+    known_pattern,
+    package_library,
+)
 from pyklip_diffrender.reduction import (
     COMPARISON,
     PRODUCTS,
@@ -31,6 +37,7 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
+from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
 from pyklip_diffrender.scene.sequence import SHORT, ExposureSequence, by_reason
 from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_opd
@@ -124,6 +131,8 @@ def run_reduction(
             claim_folder(folder, tuple(PRODUCTS))
             click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
         prepared.append(start.prepared(sequence))
+        if dry_run:
+            click.echo(describe_steps(prepared[-1].sequence, prepared[-1].options))
     if dry_run:
         return
     summaries = {
@@ -177,6 +186,42 @@ def _compared(summaries: Mapping[Path, Any], place: Path, **search: Any) -> None
     if isinstance(combination, Combination):
         combination.write(place)
     click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
+
+
+def describe_steps(sequence: ExposureSequence, options: ReduceOptions) -> str:
+    """The steps of a reduction of a cut sequence, one in each line."""
+    pattern = options.pattern
+    searched = pattern == "auto" or isinstance(pattern, PatternLibrary)
+    libraries = [pattern] if isinstance(pattern, PatternLibrary) else []
+    library = combine_libraries([*libraries, package_library()])
+    known = searched and known_pattern(sequence.science[0], library=library) is not None
+    teaching, joining = (
+        frames(sequence, options) for frames in (frames_for_pattern, frames_in_likelihood)
+    )
+    steps = []
+    if known or not (searched or pattern == "references"):
+        teaching = ()
+    if known:
+        unplaced = [each.name for each in sequence.science if each.first_pixel is None]
+        steps += [f"place of {name} on the detector" for name in unplaced]
+    steps += [f"reference star {star}" for star in dict.fromkeys(e.target for e in teaching)]
+    steps.append("wavefront")
+    if joining:
+        steps.append("reference stars and target together")
+    steps.append("search")
+    if options.disk:
+        steps += ["extended light, and wavefront without it", "search without extended light"]
+    if options.wide:
+        steps.append("whole frames")
+    if options.injections:
+        steps.append(f"{options.injections} injected planets")
+    if options.completeness:
+        steps.append("completeness")
+    used = [*teaching, *joining]
+    unused = sum(not any(each is one for one in used) for each in sequence.references)
+    only = f", with {unused} reference frame{'' if unused == 1 else 's'} for KLIP only"
+    steps.append(f"products{only if unused else ''}")
+    return "\n".join(f"{number}. {step}" for number, step in enumerate(steps, 1))
 
 
 def _require_flux_and_spectra(

@@ -393,7 +393,7 @@ search = _all(
                 "FITS or VOTable with units; without any they are micron and Jy. "
                 'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
     option("--dry-run", is_flag=True, section="Output",
-           help="Make all checks, show frames and OPD map, and stop."),
+           help="Make all checks, show frames, OPD map and steps, and stop."),
     option("--derivatives", is_flag=True, section="Output",
            help="Keep the fit's derivatives in fit.fits, which then takes ten times the space: "
            "they are needed to search the fit again."),
