@@ -365,6 +365,8 @@ def through_a_survey(request, folder):
             "name": name, **options,
         })  # fmt: skip
     config = {"workers": 0, "sequence": sequences}
+    if request.spectra != SPECTRA:
+        config["combined"] = {"spectra": list(request.spectra)}
     table = dr.survey(config, folder)
     failed = table[table["status"] == "failed"]
     if len(failed):
@@ -375,13 +377,11 @@ def through_a_survey(request, folder):
         assert row["recovered"]
         assert abs(away) < 3 * row["recovered_error"]
         assert not (folder / "jobs" / row["folder"] / "fit.fits").exists()
-    folders = [folder / "jobs" / name for name in table["folder"][plain]]
-    searches, summaries = _products(folders)
+    searches, summaries = _products(folder / "jobs" / name for name in table["folder"][plain])
     for each in summaries:
         each["injections"] = np.sum(~plain)  # These are jobs of their own.
-    several = len(folders) > 1
-    combined = dr.combine(folders, spectra=request.spectra).to_dict() if several else None
-    return Found(searches, summaries, combined)
+    combined = table.meta["combined"]
+    return Found(searches, summaries, combined[0] if combined else None)
 
 
 DOORS = {

@@ -6,18 +6,20 @@ import sys
 import time
 from dataclasses import replace
 from datetime import date
+from functools import partial
 from math import inf
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import QTable, Table
 from survey_stubs import HOSTILE, Tags, configuration, inputs, result, stub
 
 import pyklip_diffrender as dr
 from benchmarks import faults
 from benchmarks.calints_files import SIDE, calints
+from benchmarks.synthetic_searches import searched, write_searched
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.surveys import execution
@@ -115,6 +117,9 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path):
         ((1,), "wide", "yes", ["sequence 2: wide", "true or false"]),
         ((), "options", {"settings": {"tolerance": []}}, ["options: settings", "wrong type"]),
         ((), "options", {"disk": True, "wide": True}, ["options", "one of them"]),
+        ((), "combined", {"spectra": ["no.ecsv"]}, ["combined: spectra", "no.ecsv", "'flat'"]),
+        ((), "combined", {"spectra": []}, ["combined: spectra", "[]"]),
+        ((), "combined", {"parallax": 0.1}, ["combined: got the key 'parallax'", "spectra"]),
         ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
         ((), "injections", {"contrasts": [12.5]}, ["contrasts", "no magnitudes"]),
         ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
@@ -442,6 +447,94 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path, monkeypa
     links = [each["href"] for tag, each in Tags(text).tags if tag == "a"]
     assert links
     assert all((output / link).exists() for link in links)
+
+
+STAR = {"TARGPROP": "HD 1", "TARG_RA": 10.0, "TARG_DEC": 5.0}
+OTHER = {"TARGPROP": "HD 2", "TARG_RA": 90.0, "TARG_DEC": 5.0}
+PLACE = (0.6, 0.35)
+
+SEARCHED = {
+    "star0_calints": partial(searched, "F444W", 1, [(*PLACE, 4.2)], north=20.0, header=STAR),
+    "star1_calints": partial(searched, "F356W", 2, [(*PLACE, 4.0)], header=STAR),
+    "star2_calints": partial(searched, "F300M", 3, [(-0.5, 0.4, 30.0)], known=True,
+                             status="MODEL_MISMATCH", header=STAR),
+    "star3_calints": partial(searched, "F444W", 4, header=OTHER),
+}  # fmt: skip
+"""Searches by the name of the job: a planet that is too faint for each of two filters, a fit that
+does not explain its data, and another star."""
+
+
+def searching(job, folder):
+    """A job whose search is one of `SEARCHED`; nothing is fitted."""
+    write_searched(SEARCHED[job.name](), folder)
+    return result()
+
+
+def test_filters_of_a_star_are_searched_together_at_the_end(tmp_path, command):
+    assert command(searching, 4) == 0
+    (folder,) = (tmp_path / "out" / "combined").iterdir()
+    assert folder.name.startswith("HD-1_")
+    assert sorted(each.name for each in folder.iterdir()) == [
+        "combined.fits", "combined_candidates.ecsv", "combined_limits.ecsv", "comparison.html",
+        "comparison.json",
+    ]  # fmt: skip
+    (row,) = QTable.read(folder / "combined_candidates.ecsv")
+    # 4.1 sqrt(2) and the noise of these seeds; each filter alone needs 5.
+    assert f"{row['snr']:.1f} {row['separation'].value:.3f}" == "5.4 0.698"
+    assert np.hypot(row["delta_ra"].value - PLACE[0], row["delta_dec"].value - PLACE[1]) < 0.06
+    text = (tmp_path / "out" / "survey.html").read_text(encoding="utf-8")
+    section = text.partition("Filters and epochs together")[2].partition("</section>")[0]
+    assert "MODEL_MISMATCH" in section
+    assert "HD 2" not in section
+    (link,) = (each["href"] for tag, each in Tags(section).tags if tag == "a")
+    page = folder / "comparison.html"
+    assert (tmp_path / "out" / link).samefile(page)
+    links = [each.get("href", "") for _, each in Tags(page.read_text(encoding="utf-8")).tags]
+    reports = [folder / each for each in links if "report.html" in each]
+    assert len(reports) == 3
+    assert all(each.exists() for each in reports)
+
+
+def test_a_combined_search_is_kept_until_its_jobs_or_spectra_change(tmp_path, caplog):
+    caplog.set_level("INFO")
+    config = inputs(tmp_path / "data", 3)
+    output, first = tmp_path / "out", {**config, "sequence": config["sequence"][:2]}
+
+    def combined(config):
+        (made,) = run_survey(config, output, searching).meta["combined"]
+        return made
+
+    before = combined(first)
+    assert before["filters"] == ["F444W", "F356W"]
+    page = output / before["folder"] / "comparison.html"
+    page.write_text("kept")
+    assert combined(first) == before
+    assert page.read_text() == "kept"
+    assert caplog.text.count("combined search of") == 1
+    # A damaged one is made again.
+    page.with_name("comparison.json").write_text("{")
+    assert combined(first) == before
+    assert page.read_text() != "kept"
+    flat = combined({**first, "combined": {"spectra": ["flat"]}})
+    assert [each["name"] for each in flat["spectra"]] == ["flat"]
+    assert not flat["free"]
+    assert len({each["folder"] for each in (before, flat, combined(config))}) == 3
+    assert hidden(output) == []
+    assert not [each for each in (output / "combined").iterdir() if each.name.startswith(".")]
+
+
+def test_what_cannot_be_searched_together_is_said(tmp_path, command, monkeypatch):
+    """Two jobs of one frame with other options are one observation; epochs need a motion."""
+    later = partial(searched, "F444W", 5, mjd=60400.0, header=STAR)
+    monkeypatch.setitem(SEARCHED, "wide", SEARCHED["star0_calints"])
+    config = inputs(tmp_path / "data", 1)
+    config["sequence"].append({**config["sequence"][0], "name": "wide", "wide": True})
+    (twice,) = run_survey(config, tmp_path / "twice", searching).meta["combined"]
+    assert "its frames are also in F444W 2023-02-25" in twice["reason"]
+    monkeypatch.setitem(SEARCHED, "star1_calints", later)
+    assert command(searching, 2) == 0
+    words = "no combined search: combine: got reductions of several epochs"
+    assert words in (tmp_path / "out" / "survey.html").read_text(encoding="utf-8")
 
 
 def test_without_the_extra(tmp_path, monkeypatch):

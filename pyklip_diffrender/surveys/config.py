@@ -24,6 +24,9 @@ _WORKERS = Option(
     "workers", None, "Processes.", int, expected="a number of processes, 0 or more"
 )  # fmt: skip
 
+_SPECTRA = ("blackbody", "flat", "free")
+"""Names of spectra that `combine` knows."""
+
 _NOT_IN_TOML = ("basis", "prior", "drift", "dither_drift", "companions", "memory")
 """Fields of FitSettings that are objects of Python, and the memory, for which surveys have
 `memory_limit`."""
@@ -102,11 +105,15 @@ class Config:
         Processes; None for one per core, 0 for this process alone.
     memory_limit : float or None
         Memory of each worker, bytes; None for an equal share of the machine's.
+    spectra : tuple of str
+        Spectra of planets for the search over the filters of a star, see `combine`; empty for its
+        defaults.
     """
 
     sequences: tuple[SequenceConfig, ...]
     workers: int | None = None
     memory_limit: float | None = None
+    spectra: tuple[str, ...] = ()
 
 
 def read_config(source: str | os.PathLike[str] | Mapping[str, Any]) -> Config:
@@ -197,11 +204,16 @@ class _Reader:
             "memory_limit": ('text such as "4 GB"', lambda value: to_bytes(_text(value), "")),
             "options": _TABLE,
             "injections": _TABLE,
+            "combined": _TABLE,
             "sequence": ("one or more tables [[sequence]]", _list),
         })  # fmt: skip
         given = self.values(top.pop("options", {}), "options", self.option_keys)
         options = self.options(given, Options(), "options")
         planets = self.injections(top.pop("injections", {}), Injections(), "injections")
+        names = ", ".join(map(repr, _SPECTRA))
+        combined = self.values(top.pop("combined", {}), "combined", {
+            "spectra": (f"a list of {names} or existing tables", self.spectra),
+        })  # fmt: skip
         if "sequence" not in content:
             self.complain("sequence", "none", "one or more tables [[sequence]] with files and opd")
         sequences: list[SequenceConfig] = []
@@ -213,7 +225,7 @@ class _Reader:
                 expected = "a name that no other sequence has; add `name`"
                 self.complain(f"sequence {k}: name", sequence.name, expected)
             sequences.append(sequence)
-        return Config(tuple(sequences), **top)
+        return Config(tuple(sequences), **top, **combined)
 
     def sequence(
         self, content: Any, place: str, options: Options, planets: Injections
@@ -311,6 +323,12 @@ class _Reader:
         except DiffrenderError as error:
             raise ValueError(str(error)) from error
         return str(path)
+
+    def spectra(self, value: Any) -> tuple[str, ...]:
+        """Spectra of planets: their names, or paths of tables."""
+        return tuple(
+            each if each in _SPECTRA else str(self.existing(each)) for each in _list(value)
+        )
 
     def existing(self, value: Any) -> Path:
         """A path that exists."""

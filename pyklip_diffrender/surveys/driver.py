@@ -27,6 +27,7 @@ from pyklip_diffrender.surveys.jobs import (
     rename_to_jobs,
     staged,
 )
+from pyklip_diffrender.surveys.stars import StarSearch, search_stars
 from pyklip_diffrender.surveys.survey_page import row, table_of
 
 _log = logging.getLogger(__name__)
@@ -57,8 +58,9 @@ def survey(
     config : path or mapping
         TOML file, or its content; see :doc:`the guide </howto/survey>`.
     output : path
-        Folder for ``jobs/NAME_KEY/`` with the products of each job, ``results.ecsv`` and
-        ``survey.html``. Several surveys may use the same folder.
+        Folder for ``jobs/NAME_KEY/`` with the products of each job, ``combined/STAR_KEY/`` with
+        the search over all filters and epochs of each star that has several, ``results.ecsv``
+        and ``survey.html``. Several surveys may use the same folder.
     scheduler : str, optional
         Address of a dask scheduler, such as ``tcp://host:8786``. Default processes on this
         machine, as many as the configuration says.
@@ -68,7 +70,9 @@ def survey(
     Returns
     -------
     Table
-        One row for each job; what is not known is masked.
+        One row for each job; what is not known is masked. ``table.meta["combined"]`` has what the
+        searches over filters and epochs say: a dict for each star, with its name (`star`), the
+        `folder`, and its `candidates`, or the `reason` why it was not searched.
 
     Raises
     ------
@@ -138,10 +142,15 @@ def run_survey(
                 board.add(job, record)
                 bar.set_postfix(failed=board.failures)
                 bar.update()
+        board.stars = search_stars(board.jobs, output, read.spectra)
     finally:
         clean(jobs)
         board.write()
-    return table_of(board.rows)
+    table = table_of(board.rows)
+    table.meta["combined"] = [
+        {"star": each.star, "folder": each.folder, **each.combined} for each in board.stars
+    ]
+    return table
 
 
 def _execute(
@@ -167,6 +176,7 @@ class _Board:
     def __init__(self, todo: list[Job], output: Path) -> None:
         self.output, self.todo = output, todo
         self.records: dict[str, Record] = {}
+        self.stars: list[StarSearch] = []
         for job in todo:
             record = read_record(output / "jobs" / job.folder)
             if record is not None:
@@ -219,7 +229,7 @@ class _Board:
         """Write tables and page; raises IncompatibleSetupError if they cannot be written."""
         from pyklip_diffrender.surveys.survey_page import page
 
-        text = page(self.jobs)
+        text = page(self.jobs, self.stars)
         # Written beside the old ones and then moved: whoever reads them meanwhile gets whole files.
         try:
             with staged(self.output / "jobs", "tables") as folder:

@@ -13,8 +13,10 @@ from astropy.table import MaskedColumn, Table
 from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.io.progress import duration
+from pyklip_diffrender.reduction import COMPARISON
 from pyklip_diffrender.reduction.pages import Picture, count, render
 from pyklip_diffrender.surveys.jobs import Job, Record
+from pyklip_diffrender.surveys.stars import StarSearch
 
 # The table of results: one row for each job.
 
@@ -117,8 +119,8 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
 Jobs = Sequence[tuple[Job, Record | None]]
 
 
-def page(jobs: Jobs) -> str:
-    """The page of jobs with records, None for one that waits."""
+def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
+    """The page of jobs with records (None for one that waits), and of the combined searches."""
     rows = [{**row(job, record), "label": str(job)} for job, record in jobs]
     states = [each["status"] for each in rows]
     done, failed, waiting = map(states.count, ("finished", "failed", "waiting"))
@@ -158,6 +160,10 @@ def page(jobs: Jobs) -> str:
             for job, result in _reduced(jobs)
             for each in result.get("candidates", ())
         ],
+        stars=[
+            (each, found) for each in stars for found in each.combined.get("candidates") or [None]
+        ],
+        comparison=COMPARISON[0],
     )
 
 
