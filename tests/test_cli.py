@@ -1,5 +1,6 @@
 """The command line: what it writes, what it refuses before any work, and where errors go."""
 
+import io
 import json
 import logging
 import re
@@ -480,6 +481,26 @@ def test_too_little_memory_is_a_message(detecting, capsys, reduced, error):
     reduced.error = RuntimeError("a bug")
     with pytest.raises(RuntimeError, match="a bug"):
         main(detecting)
+
+
+def closed():
+    stream = io.StringIO()
+    stream.close()
+    return stream
+
+
+class Broken(io.StringIO):
+    def flush(self):
+        raise OSError("Bad file descriptor")
+
+
+@pytest.mark.parametrize("stream", [lambda: None, closed, Broken])
+def test_a_program_without_standard_streams_ends_as_with_them(monkeypatch, capsys, stream):
+    monkeypatch.setattr(sys, "stdout", stream())
+    monkeypatch.setattr(sys, "stderr", stream())
+    failing = ["learn", "x", "--opd", "flat", "-o", "no/such/library.fits"]
+    for arguments, status in ((["--help"], 0), (failing, 1), (["x"], 2)):
+        assert main(arguments) == status
 
 
 def test_an_interrupted_run_keeps_what_it_has_written(tmp_path, detecting, reduced, capsys):

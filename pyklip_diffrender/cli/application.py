@@ -27,6 +27,7 @@ from pyklip_diffrender.cli.session import (
     importing,
     keep_freed_memory,
     named_files,
+    open_streams,
     option,
     outputs,
     require_frames,
@@ -417,7 +418,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     keep_freed_memory()
     run = Run()
-    with run.messages():
+    with open_streams(), run.messages():
         try:
             status = application.main(arguments, prog_name=PROGRAM, standalone_mode=False, obj=run)
         except click.ClickException as error:

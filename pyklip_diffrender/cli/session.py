@@ -47,6 +47,35 @@ def keep_freed_memory() -> None:
         mallopt(_TRIM_THRESHOLD, 2**31 - 1)
 
 
+def _takes_text(stream: Any) -> bool:
+    """Whether a standard stream exists and is open: under ``pythonw`` there is none."""
+    if stream is None or stream.closed:
+        return False
+    try:
+        stream.flush()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+@contextmanager
+def open_streams() -> Iterator[None]:
+    """Put an empty file in place of standard streams that are missing or closed."""
+    # Without them, as under ``pythonw``, in a job of a scheduler or after ``2>&-``, the first
+    # message or progress bar would end the program.
+    before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
+    with open(os.devnull, "w", encoding="utf-8") as nowhere:
+        try:
+            for name, stream in before.items():
+                if not _takes_text(stream):
+                    setattr(sys, name, nowhere)
+            yield
+        finally:
+            for name, stream in before.items():
+                if getattr(sys, name) is nowhere:
+                    setattr(sys, name, stream)
+
+
 @contextmanager
 def importing() -> Iterator[None]:
     """Import libraries without a search for garbage, and leave them out of later searches.
