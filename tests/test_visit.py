@@ -450,9 +450,9 @@ def test_exposure_sequences():
 def test_the_size_of_the_drift_is_that_of_the_frames(monkeypatch):
     steps, measure = [], Annealing._measure_priors
 
-    def recorded(self, course):
+    def recorded(self, course, may_widen):
         steps.append(len(self.history))
-        measure(self, course)
+        measure(self, course, may_widen)
 
     monkeypatch.setattr(Annealing, "_measure_priors", recorded)
     stated = WavefrontPrior({"segment": 0.6, "texture": 0.3}, knee=1.0)
