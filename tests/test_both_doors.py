@@ -129,7 +129,7 @@ def map_file(folder):
 def settings_of(files):
     """Settings that do not take the files to be opened by the package."""
     passband = fits.getheader(files[0])["FILTER"]
-    return FitSettings.nircam(passband, image_mask="MASK335R", module="A", **SETTINGS)
+    return FitSettings.nircam(passband, image_mask="MASK335R", **SETTINGS)
 
 
 def through_reduce(files, folder):

@@ -100,8 +100,8 @@ REFUSED = [
             "a pattern is of one filter"),
     Refusal("spaceklip", {"pattern_file": "file", "filters": FILTERS}, IncompatibleSetupError,
             "pattern", "a pattern is of one filter; other concatenations go on", FILTERS[:1]),
-    Refusal("pyklip", {"filters": FILTERS}, IncompatibleSetupError, "spectral cubes",
-            "pyKLIP takes wavelengths of a dataset for slices of spectral cubes"),
+    Refusal("pyklip", {"filters": FILTERS}, IncompatibleSetupError, "one dataset for each filter",
+            "A dataset has one wavelength"),
     Refusal("pyklip spaceklip", {"epochs": DATES}, IncompatibleSetupError, "2 epochs", ALONE),
     Refusal("pyklip", {"spectra": ("flat",)}, TypeError, "'spectra'", ALONE),
     *(
