@@ -210,7 +210,7 @@ def test_a_rough_fit_that_does_not_explain_its_data_goes_on(world, monkeypatch):
     assert len(fine.history) > len(rough.history)
 
 
-def test_the_prior_on_the_segments_is_wider_for_an_older_map(world):
+def test_the_prior_is_wider_for_an_older_map(world):
     observation = replace(world.observed(world.expected(), 4), date=Time("2023-01-01"))
     prior = WavefrontPrior({"segment": 1.0, "texture": 0.1}, fit_scales=False)
 
@@ -220,10 +220,10 @@ def test_the_prior_on_the_segments_is_wider_for_an_older_map(world):
         return dr.refine(world.model, observation, opd, settings=settings).settings.prior.scales
 
     assert start(50, adapt_prior=True) == prior.scales
-    # As a random walk, from the 60 days on up to which the preset holds.
-    assert start(240, adapt_prior=True) == {"segment": pytest.approx(2.0), "texture": 0.1}
-    assert start(-240, adapt_prior=True)["segment"] == pytest.approx(2.0)
-    assert start(240) == prior.scales
+    # Twice as wide, for all modes alike.
+    assert start(104, adapt_prior=True) == pytest.approx({"segment": 2.0, "texture": 0.2})
+    assert start(-104, adapt_prior=True) == pytest.approx({"segment": 2.0, "texture": 0.2})
+    assert start(104) == prior.scales
 
 
 def test_the_prior_of_the_amplitude_is_widened_as_well(world):

@@ -44,10 +44,15 @@ limits of two rolls of G 7-34 6 to 11 % higher from 0.4 to 1 arcsec, and is not 
 
 _CURRENT_MAP_DAYS = 60.0
 """Days between map and frames up to which the scales of the preset hold: in the real frames with
-which they were measured, 50. The segments drift by 9 nm rms in 3.6 days (Feng et al. 2025, section
-4), and are corrected every 29 to 36 days on average, when the wavefront reaches 70 nm rms (JWST
-User Documentation, "Optics Performance and Stability"), so that the difference from an older map
-grows like a random walk."""
+which they were measured, 50."""
+
+_OLDER_MAP_RATIO = 2.0
+"""Scales of the prior for an older map over those of the preset: 51 nm rms in place of 26. The
+mirrors are corrected every 29 to 36 days on average (JWST User Documentation, "Optics Performance
+and Stability"), and maps of 2022-07-30 and 2022-08-11 differ by 45 nm. A prior that is too wide is
+narrowed. From one that is too narrow a fit ends with a star that is too bright, and stays there
+when the prior is widened: by 1.9 in frames of stpsf in F210M after a change of 38 nm, where this
+prior leads to 1.0."""
 
 _DRIFTS = (" drift", " dither")
 """Endings of the names of groups of modes in `drift` and `dither_drift`."""
@@ -286,14 +291,15 @@ class FitSettings:
         return max(0.0, 0.9 * self.memory - _PROCESS_BYTES - arrays)
 
     def for_map_of_age(self, days: float | None) -> FitSettings:
-        """Return settings whose prior on the segments has grown with the age of the map, days.
+        """Return settings for a map that was sensed so many days before or after the frames.
 
-        The settings do not change for a map of unknown age, or if `adapt_prior` is False.
+        The prior is wider for an old map. The settings do not change for a map of unknown age, or
+        if `adapt_prior` is False.
         """
-        growth = math.sqrt(abs(days or 0.0) / _CURRENT_MAP_DAYS)
-        if not self.adapt_prior or growth <= 1:
+        if not self.adapt_prior or abs(days or 0.0) <= _CURRENT_MAP_DAYS:
             return self
-        return replace(self, prior=self.prior.widened({"segment": growth}))
+        ratios = dict.fromkeys(self.prior.scales, _OLDER_MAP_RATIO)
+        return replace(self, prior=self.prior.widened(ratios))
 
     def with_wider_priors(self, ratios: Mapping[str, float]) -> FitSettings:
         """Return settings whose priors have scales multiplied by ratios above 1.
