@@ -196,7 +196,7 @@ def _rules_of_a_fit() -> list[Breakage]:
         ),
         Breakage(
             "rule-old-map", "the prior is wider for an old map",
-            "if not self.adapt_prior or growth <= 1:", "if True:", "detection",
+            "abs(days or 0.0) <= _CURRENT_MAP_DAYS:", "True:", "detection",
         ),
         Breakage(
             "deeper-limits", "at every separation the deeper search is used",
