@@ -199,6 +199,15 @@ def _rules_of_a_fit() -> list[Breakage]:
             "abs(days or 0.0) <= _CURRENT_MAP_DAYS:", "True:", "detection",
         ),
         Breakage(
+            "rule-widen-early", "a fit that goes on widens its prior on the way",
+            "if may_widen and adapted is end.settings:", "if False:", "detection",
+        ),
+        Breakage(
+            "rule-not-yet-converged", "a step after which the priors change is not the last",
+            "converged = settled and course.carried.priors is priors", "converged = settled",
+            "detection",
+        ),
+        Breakage(
             "deeper-limits", "at every separation the deeper search is used",
             "is_deeper = their_limits < limits", "is_deeper = their_limits < 0 * limits", "deeper",
         ),
