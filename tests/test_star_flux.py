@@ -8,6 +8,7 @@ import pytest
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
+from astropy.time import Time
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import measured_planet
@@ -58,11 +59,16 @@ def with_header(fit, header):
     return replace(fit, frames=frames), observation
 
 
-def test_without_a_map_the_star_is_less_certain(fit, caplog):
+def test_without_a_current_map_the_star_is_less_certain(fit, caplog):
     assert star_flux_error(with_header(fit, fits.Header())[0]) == 0.0  # Of a simulated frame.
     flat = as_opd_map("flat")
     assert star_flux_error(replace(fit, initial=flat)) == 0.4
     assert star_flux_error(replace(fit, initial=flat, catalogue_error=0.05)) == 0.05
+    observation = replace(fit.frames[0].observation, date=Time("2023-01-01"))
+    dated = replace(fit, frames=(replace(fit.frames[0], observation=observation),))
+    for day, error in (("2022-11-05", 0.1), ("2022-10-30", 0.3), ("2023-04-01", 0.3)):
+        sensed = replace(fit.initial, date=Time(day))
+        assert star_flux_error(replace(dated, initial=sensed)) == error
     # A reduction says so, unless the flux is given.
     header = fit.frames[0].observation.header.copy()
     header["CORONMSK"] = "MASKA335R"

@@ -196,7 +196,7 @@ def _rules_of_a_fit() -> list[Breakage]:
         ),
         Breakage(
             "rule-old-map", "the prior is wider for an old map",
-            "abs(days or 0.0) <= _CURRENT_MAP_DAYS:", "True:", "detection",
+            "if not self.adapt_prior or not is_old_map(days):", "if True:", "detection",
         ),
         Breakage(
             "rule-widen-early", "a fit that goes on widens its prior on the way",
@@ -339,8 +339,7 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "no-map", "without a map the star's flux is uncertain by 40 %",
-            "return _FLUX_ERROR if fit.initial.data.any() else _FLUX_ERROR_FLAT_START",
-            "return _FLUX_ERROR",
+            "return _FLUX_ERROR_FLAT_START", "return _FLUX_ERROR",
             "star_flux",
         ),
         Breakage(

@@ -31,7 +31,12 @@ from pyklip_diffrender.refinement.fit_result import (
     breakdown_explained,
 )
 from pyklip_diffrender.refinement.forward import Problem, starting_values
-from pyklip_diffrender.refinement.settings import OWN_PARAMETERS, FitSettings, settings_for
+from pyklip_diffrender.refinement.settings import (
+    OWN_PARAMETERS,
+    FitSettings,
+    is_old_map,
+    settings_for,
+)
 from pyklip_diffrender.scene.admission import require_agreement
 from pyklip_diffrender.scene.detector_pattern import DetectorPattern, require_pattern_of
 from pyklip_diffrender.scene.objects import Planet
@@ -382,6 +387,11 @@ _FLUX_ERROR = 0.1
 is seen, and the prior on the wavefront decides how much of it a star has: fits with a star 10 %
 brighter or fainter explain real frames nearly as well (docs/validation/real_frames.md)."""
 
+_FLUX_ERROR_OLD_MAP = 0.3
+"""Relative error if the map is too old for the preset's prior: in frames of stpsf whose wavefront
+had changed by 38 nm rms, stars came out 0.9 to 1.25 times as bright as they are, and 1.3 to 1.9
+times in first looks (docs/validation/references.md)."""
+
 _FLUX_ERROR_FLAT_START = 0.4
 """Relative error for fits that start from a flat wavefront: two rolls of G 7-34 came out 2 % too
 faint in F444W, and 44 % too bright in F356W."""
@@ -551,10 +561,16 @@ def star_flux_error(fit: Refinement) -> float:
     """Relative error of the star's flux that is not in the fit's own covariance.
 
     The error of the catalogue, if there is one. Otherwise 10 % for real frames, where only
-    diffracted light tells how bright the star is (40 % without an OPD map), and 0 for others.
+    diffracted light tells how bright the star is (30 % with an OPD map more than 60 days from the
+    frames, 40 % without a map), and 0 for others.
     """
+    observation = fit.frames[0].observation
     if fit.catalogue_error is not None:
         return fit.catalogue_error
-    if not fit.frames[0].observation.is_nircam:
+    if not observation.is_nircam:
         return 0.0
-    return _FLUX_ERROR if fit.initial.data.any() else _FLUX_ERROR_FLAT_START
+    if not fit.initial.data.any():
+        return _FLUX_ERROR_FLAT_START
+    date = observation.date
+    is_old = is_old_map(None if date is None else fit.initial.days_after(date))
+    return _FLUX_ERROR_OLD_MAP if is_old else _FLUX_ERROR

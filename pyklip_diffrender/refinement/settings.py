@@ -54,6 +54,12 @@ narrowed. From one that is too narrow a fit ends with a star that is too bright,
 when the prior is widened: by 1.9 in frames of stpsf in F210M after a change of 38 nm, where this
 prior leads to 1.0."""
 
+
+def is_old_map(days: float | None) -> bool:
+    """Whether a map of so many days before or after the frames, if known, is not a current one."""
+    return abs(days or 0.0) > _CURRENT_MAP_DAYS
+
+
 _DRIFTS = (" drift", " dither")
 """Endings of the names of groups of modes in `drift` and `dither_drift`."""
 
@@ -296,7 +302,7 @@ class FitSettings:
         The prior is wider for an old map. The settings do not change for a map of unknown age, or
         if `adapt_prior` is False.
         """
-        if not self.adapt_prior or abs(days or 0.0) <= _CURRENT_MAP_DAYS:
+        if not self.adapt_prior or not is_old_map(days):
             return self
         ratios = dict.fromkeys(self.prior.scales, _OLDER_MAP_RATIO)
         return replace(self, prior=self.prior.widened(ratios))
