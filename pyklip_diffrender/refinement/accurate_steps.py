@@ -19,9 +19,8 @@ from pyklip_diffrender.refinement.forward import (
     State,
 )
 
-_GRADIENT_ITERATIONS = 8
-"""Largest number of iterations of one step. Seven settle two rolls and two frames of a reference
-star after their prior was widened; where they do not, new equations take as long as six more."""
+_GRADIENT_ITERATIONS = 6
+"""Largest number of iterations of one step."""
 
 _GRADIENT_TOLERANCE = 0.05
 """Part of the decrease so far below which an iteration is the last."""
