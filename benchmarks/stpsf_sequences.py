@@ -3,7 +3,8 @@
 Run from the root of the project, with stpsf installed and its data named by STPSF_PATH::
 
     STPSF_PATH=... python -m benchmarks.stpsf_sequences --output FOLDER [--cases NAME ...]
-        [--references N] [--repeat N] [--size PIXELS] [--age DAYS] [--accuracy quick]
+        [--references N] [--repeat N] [--size PIXELS] [--age DAYS] [--brightness FACTOR]
+        [--accuracy quick]
 
 Each case has two rolls of a star with two planets, as calints files with the headers of MAST. The
 images are stpsf's, with its internal wavefront errors, jitter, distortion, charge diffusion and
@@ -13,7 +14,8 @@ has an error of 2 % in every pixel, which nobody tells the reduction; pixels are
 without a flag; and there are photon and read noise. With ``--references`` a second, brighter star
 was observed at small dithers. Other numbers of ``--repeat`` have other wavefronts, flat fields,
 bad pixels and noise, and ``--size`` is the side of the fitted square. With ``--age`` the map is so
-many days old, and the wavefront has drifted accordingly.
+many days old, and the wavefront has drifted accordingly; ``--brightness`` multiplies the light of
+the star and its planets.
 
 Prints a row for each case: planets that were found and missed, false candidates, pulls of flux and
 position, scatter of the S/N without the candidates, limits over those for a known star beyond 0.5
@@ -25,6 +27,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import multiprocessing
 import os
 import resource
@@ -52,7 +55,10 @@ from pyklip_diffrender.scene import ExposureSequence, Planet
 
 ROLLS = (70.0, 80.0)
 DRIFT, BETWEEN = 6e-9, 2e-9
-"""Rms of the wavefront's change since the map, and between frames, m."""
+"""Rms of the wavefront's change since a recent map, and between frames, m."""
+
+CORRECTED_DAYS = 33.0
+"""Days between corrections of the mirrors."""
 
 STARS = ((0.002, -0.003), (-0.004, 0.001))
 """Places of the star behind the mask, arcsec."""
@@ -90,8 +96,7 @@ class Case:
     size: int = 80
     """Side of the fitted square, pixels."""
     age: float | None = None
-    """Days from the map to the frames, in which the wavefront drifts like a random walk, by 9 nm
-    rms in 3.6 days (Feng et al. 2025, section 4); None: two days, in which it drifts by `DRIFT`."""
+    """Days from the map to the frames, see `drift_in`; None: two days, without such a drift."""
     accuracy: Literal["full", "quick"] = "full"
 
     @property
@@ -102,11 +107,6 @@ class Case:
     def side(self) -> int:
         """Side of the frames, pixels."""
         return self.size + 2 * MARGIN
-
-    @property
-    def drift(self) -> float:
-        """Rms of the wavefront's change since the map, m."""
-        return DRIFT if self.age is None else 9e-9 * float(np.sqrt(self.age / 3.6))
 
     @property
     def map_name(self) -> str:
@@ -140,6 +140,17 @@ CASES = {
              _planets((1.5e-4, 0.45, 80.0), (4e-5, 0.75, 240.0)), BAR),
     )
 }  # fmt: skip
+
+
+def drift_in(days: float) -> float:
+    """Rms of the change of the wavefront within so many days, m.
+
+    It drifts like a random walk, by 9 nm rms in 3.6 days (Feng et al. 2025, section 4). The mirrors
+    are corrected every 29 to 36 days on average (JWST User Documentation, "Optics Performance and
+    Stability"): then both wavefronts have drifted from the same one, each on a path of its own.
+    """
+    drift = 9e-9 * math.sqrt(min(days, CORRECTED_DAYS) / 3.6)
+    return drift if days <= CORRECTED_DAYS else math.sqrt(2) * drift
 
 
 def map_of(instrument: Any) -> tuple[np.ndarray, fits.Header]:
@@ -210,7 +221,11 @@ def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0)
     flat = 1 + FLAT_ERROR * rng.normal(size=(side, side))
     flagged = rng.random((side, side)) < FLAGGED
     hot = rng.integers(side // 2 - 15, side // 2 + 15, (UNFLAGGED, 2))
-    drifted = opd + changed(int(seeds[0]), case.drift, len(opd))
+    drifted = opd + changed(int(seeds[0]), DRIFT, len(opd))
+    if case.age is not None:
+        hours = drift_in(case.age) / 9e-9 * 86  # It drifts by 9 nm in 86 hours.
+        drift = dr.wavefront.random_drift(int(seeds[0]), hours, npix=256).data
+        drifted = drifted + np.asarray(resample(drift, len(opd)))
     for k, (roll, star) in enumerate(zip(ROLLS, STARS, strict=True), 1):
         now = drifted + changed(int(seeds[k]), BETWEEN, len(opd))
         light = image(instrument, case, now, header, star, case.nlambda[0])
@@ -411,6 +426,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=0, choices=range(60))
     parser.add_argument("--size", type=int, default=Case.size)
     parser.add_argument("--age", type=float, help="days from the map to the frames")
+    parser.add_argument("--brightness", type=float, default=1.0)
     parser.add_argument("--accuracy", default=Case.accuracy, choices=["full", "quick"])
     options = parser.parse_args()
     context = multiprocessing.get_context("spawn")
@@ -418,8 +434,15 @@ def main() -> None:
         again = f"_{options.repeat}" if options.repeat else ""
         other = f"_size{options.size}" if options.size != Case.size else ""
         other += "" if options.age is None else f"_age{options.age:g}"
+        other += "" if options.brightness == 1 else f"_brightness{options.brightness:g}"
         folder = options.output / f"{name.replace(' ', '_')}_{options.references}{again}{other}"
-        case = replace(CASES[name], size=options.size, age=options.age, accuracy=options.accuracy)
+        case = replace(
+            CASES[name],
+            size=options.size,
+            flux=options.brightness * CASES[name].flux,
+            age=options.age,
+            accuracy=options.accuracy,
+        )
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             try:
                 about = (case, folder, options.references, options.repeat)
