@@ -389,7 +389,7 @@ brighter or fainter explain real frames nearly as well (docs/validation/real_fra
 
 _FLUX_ERROR_OLD_MAP = 0.3
 """Relative error if the map is too old for the preset's prior: in frames of stpsf whose wavefront
-had changed by 38 nm rms, stars came out 0.9 to 1.25 times as bright as they are, and 1.3 to 1.9
+had changed by 38 nm rms, stars came out 0.9 to 1.4 times as bright as they are, and 1.0 to 1.9
 times in first looks (docs/validation/references.md)."""
 
 _FLUX_ERROR_FLAT_START = 0.4
