@@ -182,8 +182,7 @@ CASES: dict[str, Callable[[Path], Numbers]] = {
 """Functions of the folder of the data."""
 
 IN_TESTS = (
-    "HIP-65426", "HIP17695, F356W", "V-AU-MIC, F444W, roll 1", "G-7-34, F444W, with references",
-    "pyKLIP",
+    "HIP-65426", "V-AU-MIC, F444W, roll 1", "G-7-34, F444W, with references", "pyKLIP",
 )  # fmt: skip
 """Cases of the full tier of the tests."""
 
