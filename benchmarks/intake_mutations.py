@@ -413,6 +413,8 @@ MUTATIONS["APERNAME of the full frame"] = _cards("doubtful", APERNAME="NRCA5_FUL
 @_mutation("a reference with the target's name")
 def _namesake(folder: Folder, name: str, rng: np.random.Generator) -> None:
     names = sorted(folder.sources)
+    if not folder.bad.isdisjoint((names[0], names[-1])):
+        return  # They may be incomplete.
     with fits.open(folder.path / names[0]) as hdus:
         target = hdus[0].header["TARGPROP"]
     folder.change(names[-1], lambda hdus, _: _set(hdus, TARGPROP=target, TARGNAME=target), rng)
