@@ -78,7 +78,7 @@ class _Search(Protocol):
 def draw_search(ax: Any, search: _Search, labels: Sequence[str]) -> NDArray[Any]:
     """Draw the S/N map with the candidates, which have labels, and the contrast curve.
 
-    Returns the two axes: `ax`, or those of a new figure for None.
+    Returns the two axes: `ax`, or the axes of a new figure for None.
     """
     axes, table = drawing.axes_for(ax, 2), search.candidates
     drawing.snr_map(
@@ -267,8 +267,8 @@ class Detection:
         the star's flux (10 % for real frames with a map of the last 60 days, unless
         ``reduce(star_flux=...)`` says it), of the source's own image and of its position; the flux
         density's error does not depend on the star's flux. The S/N is the contrast over its error
-        for a known position and image, because
-        the others do not change the significance of a source.
+        for a known position and image, because the others do not change the significance of a
+        source.
         """
         table = candidate_table(self.sources, self.error_factor, self._calibration_errors, self.sky)
         order = np.argsort(-self.sources.snr(self.error_factor))

@@ -234,7 +234,7 @@ def detector_place(mask: str | None, filter: str, place: str | None = None) -> D
     Without a mask, the place belongs to the mask that is made for the filter's channel
     (MASK210R or MASK335R). `place` is the star's along a bar: a filter of its channel, for the
     fiducial of that filter, "NARROW", or "-", the middle; default the fiducial of `filter`, or the
-    middle if it has none. The detectors are those of module A, with which JWST observes.
+    middle if it has none. The detectors belong to module A, with which JWST observes.
     IncompatibleSetupError for an unknown mask, filter or place.
     """
     short_wave = is_short_wave(filter)

@@ -47,7 +47,7 @@ _CURRENT_MAP_DAYS = 60.0
 which they were measured, 50."""
 
 _OLDER_MAP_RATIO = 2.0
-"""Scales of the prior for an older map over those of the preset: 51 nm rms in place of 26. The
+"""Ratio of the prior's scales for an older map to the preset's: 51 nm rms in place of 26. The
 mirrors are corrected every 29 to 36 days on average (JWST User Documentation, "Optics Performance
 and Stability"), and maps of 2022-07-30 and 2022-08-11 differ by 45 nm. A prior that is too wide is
 narrowed. From one that is too narrow a fit ends with a star that is too bright, and stays there
