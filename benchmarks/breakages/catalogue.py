@@ -196,7 +196,7 @@ def _rules_of_a_fit() -> list[Breakage]:
         ),
         Breakage(
             "rule-old-map", "the prior is wider for an old map",
-            "if not self.adapt_prior or not is_old_map(days):", "if True:", "detection",
+            "if not self.adapt_prior or age_of_map(days) <= 1:", "if True:", "detection",
         ),
         Breakage(
             "rule-widen-early", "a fit that goes on widens its prior on the way",

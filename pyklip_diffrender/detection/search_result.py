@@ -264,11 +264,11 @@ class Detection:
         Errors are standard deviations, with all parameters of the star marginalised. Errors of
         positions include the error of the star's position behind the mask, and do not include
         errors of the pixel scale and of the roll angle. The contrast's error includes errors of
-        the star's flux (10 % for real frames with a map of the last 60 days, unless
-        ``reduce(star_flux=...)`` says it), of the source's own image and of its position; the flux
-        density's error does not depend on the star's flux. The S/N is the contrast over its error
-        for a known position and image, because the others do not change the significance of a
-        source.
+        the star's flux (10 % for real frames with a map of the day, and up to 30 % with an older
+        one, unless ``reduce(star_flux=...)`` says it), of the source's own image and of its
+        position; the flux density's error does not depend on the star's flux. The S/N is the
+        contrast over its error for a known position and image, because the others do not change
+        the significance of a source.
         """
         table = candidate_table(self.sources, self.error_factor, self._calibration_errors, self.sky)
         order = np.argsort(-self.sources.snr(self.error_factor))

@@ -34,7 +34,7 @@ from pyklip_diffrender.refinement.forward import Problem, starting_values
 from pyklip_diffrender.refinement.settings import (
     OWN_PARAMETERS,
     FitSettings,
-    is_old_map,
+    age_of_map,
     settings_for,
 )
 from pyklip_diffrender.scene.admission import require_agreement
@@ -383,14 +383,17 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
 # The flux of the star: from a fit to Jansky, and from a catalogue into a fit.
 
 _FLUX_ERROR = 0.1
-"""Relative error of the star's flux in real frames if no catalogue says it. Only diffracted light
-is seen, and the prior on the wavefront decides how much of it a star has: fits with a star 10 %
-brighter or fainter explain real frames nearly as well (docs/validation/real_frames.md)."""
+"""Relative error of the star's flux in real frames with a map of the day, if no catalogue says it.
+Only diffracted light is seen, and the prior on the wavefront decides how much of it a star has: fits
+with a star 10 % brighter or fainter explain real frames nearly as well
+(docs/validation/real_frames.md)."""
 
 _FLUX_ERROR_OLD_MAP = 0.3
 """Relative error if the map is too old for the preset's prior: in frames of stpsf whose wavefront
 had changed by 38 nm rms, stars came out 0.9 to 1.4 times as bright as they are, and 1.0 to 1.9
-times in first looks (docs/validation/references.md)."""
+times in first looks (docs/validation/references.md). Until then the error grows in proportion to the
+age of the map: with one of 50 days, fits of the rolls of G 7-34 alone have a star up to 1.23 times
+as bright as fits with the rolls of HIP 17695."""
 
 _FLUX_ERROR_FLAT_START = 0.4
 """Relative error for fits that start from a flat wavefront: two rolls of G 7-34 came out 2 % too
@@ -560,9 +563,9 @@ def _scale(frame: FrameFit) -> float:
 def star_flux_error(fit: Refinement) -> float:
     """Relative error of the star's flux that is not in the fit's own covariance.
 
-    The error of the catalogue, if there is one. Otherwise 10 % for real frames, where only
-    diffracted light tells how bright the star is (30 % with an OPD map more than 60 days from the
-    frames, 40 % without a map), and 0 for others.
+    The error of the catalogue, if there is one. Otherwise, for real frames, where only diffracted
+    light tells how bright the star is, 10 % with an OPD map of the day, which grows to 30 % with
+    one of 60 days or more, and 40 % without a map. It is 0 for other frames.
     """
     observation = fit.frames[0].observation
     if fit.catalogue_error is not None:
@@ -572,5 +575,5 @@ def star_flux_error(fit: Refinement) -> float:
     if not fit.initial.data.any():
         return _FLUX_ERROR_FLAT_START
     date = observation.date
-    is_old = is_old_map(None if date is None else fit.initial.days_after(date))
-    return _FLUX_ERROR_OLD_MAP if is_old else _FLUX_ERROR
+    age = age_of_map(None if date is None else fit.initial.days_after(date))
+    return _FLUX_ERROR + min(age, 1.0) * (_FLUX_ERROR_OLD_MAP - _FLUX_ERROR)

@@ -55,9 +55,9 @@ when the prior is widened: by 1.9 in frames of stpsf in F210M after a change of 
 prior leads to 1.2 to 1.4."""
 
 
-def is_old_map(days: float | None) -> bool:
-    """Whether a map of so many days before or after the frames, if known, is not a current one."""
-    return abs(days or 0.0) > _CURRENT_MAP_DAYS
+def age_of_map(days: float | None) -> float:
+    """Time between map and frames as a fraction of `_CURRENT_MAP_DAYS`; 0 if it is not known."""
+    return abs(days or 0.0) / _CURRENT_MAP_DAYS
 
 
 _DRIFTS = (" drift", " dither")
@@ -302,7 +302,7 @@ class FitSettings:
         The prior is wider for an old map. The settings do not change for a map of unknown age, or
         if `adapt_prior` is False.
         """
-        if not self.adapt_prior or not is_old_map(days):
+        if not self.adapt_prior or age_of_map(days) <= 1:
             return self
         ratios = dict.fromkeys(self.prior.scales, _OLDER_MAP_RATIO)
         return replace(self, prior=self.prior.widened(ratios))
