@@ -235,8 +235,8 @@ class SharedOptions:
             Contrasts then refer to it, as spaceKLIP's do. By
             default the light that is diffracted around the mask determines the star's flux, to
             10 % (30 % with an old OPD map), which errors of contrasts include; a value that differs
-            from it by more than a factor of three is refused after the fit, before the search. Flux densities of planets
-            do not depend on it. Takes a second, shorter fit.""",
+            from it by more than a factor of three is refused after the fit, before the search. Flux
+            densities of planets do not depend on it. Takes a second, shorter fit.""",
         "expected": "a flux density in Jy, such as 0.45",
         "help": """Flux density of the star in the filter, such as "0.45 Jy", to which contrasts
             refer; default: what diffracted light says, to 10 % or more.""",

@@ -384,16 +384,16 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
 
 _FLUX_ERROR = 0.1
 """Relative error of the star's flux in real frames with a map of the day, if no catalogue says it.
-Only diffracted light is seen, and the prior on the wavefront decides how much of it a star has: fits
-with a star 10 % brighter or fainter explain real frames nearly as well
+Only diffracted light is seen, and the prior on the wavefront decides how much of it a star has:
+fits with a star 10 % brighter or fainter explain real frames nearly as well
 (docs/validation/real_frames.md)."""
 
 _FLUX_ERROR_OLD_MAP = 0.3
 """Relative error if the map is too old for the preset's prior: in frames of stpsf whose wavefront
 had changed by 38 nm rms, stars came out 0.9 to 1.4 times as bright as they are, and 1.0 to 1.9
-times in first looks (docs/validation/references.md). Until then the error grows in proportion to the
-age of the map: with one of 50 days, fits of the rolls of G 7-34 alone have a star up to 1.23 times
-as bright as fits with the rolls of HIP 17695."""
+times in first looks (docs/validation/references.md). Until then the error grows in proportion to
+the age of the map: with one of 50 days, fits of the rolls of G 7-34 alone have a star up to 1.23
+times as bright as fits with the rolls of HIP 17695."""
 
 _FLUX_ERROR_FLAT_START = 0.4
 """Relative error for fits that start from a flat wavefront: two rolls of G 7-34 came out 2 % too
