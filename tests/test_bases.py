@@ -9,6 +9,7 @@ import torch
 from pyklip_diffrender.instrument import TABULATED_GAP, is_jwst_pupil, jwst_pupil, jwst_segments
 from pyklip_diffrender.optics import JWST_DIAMETER, PupilGrid, polygon_coverage, widen_polygon
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.bases import coefficients_of
 
 GRID = PupilGrid.full(128)
 SEGMENTS = SegmentMotions()
@@ -99,6 +100,18 @@ def test_the_opd_is_the_sum_of_the_modes_in_any_window_and_slice():
     torch.testing.assert_close(slope, (weight * modes).sum(dim=(1, 2)), rtol=0, atol=1e-9)
     for start, stop in ((0, 1), (1, 2), (3, 8), (50, 61), (len(JOINT) - 3, len(JOINT))):
         assert torch.equal(JOINT.modes(window, start, stop), modes[start:stop])
+
+
+def test_coefficients_of_maps_make_these_maps_on_the_mirror():
+    """As nearly as the ridge leaves them."""
+    rng = np.random.default_rng(5)
+    true = torch.from_numpy(rng.normal(size=(2, len(JOINT))))
+    lit = SEGMENTS.modes(GRID, 0, len(SEGMENTS)).abs().sum(dim=0) > 0
+    maps = torch.stack([torch.where(lit, JOINT.opd(each, GRID), 0.0) for each in true])
+    fitted = coefficients_of(maps, JOINT, GRID)
+    for found, opd in zip(fitted, maps, strict=True):
+        residual = (JOINT.opd(found, GRID) - opd)[lit]
+        assert float(residual.norm() / opd[lit].norm()) < 0.02
 
 
 def test_the_joint_basis_keeps_kinds_apart():

@@ -247,6 +247,29 @@ def test_a_marginal_flux_counts_the_volume_of_the_wavefront():
     assert 0.5 * taken[0].state.flux < taken[1].state.flux < 0.99 * taken[0].state.flux
 
 
+def test_a_long_step_of_flux_and_wavefront_stays_in_the_same_light():
+    """A brighter star with a smaller wavefront: the step begins along states of the same light."""
+    solver, state = solver_of(2)
+    unknowns, change = state.unknowns, 0.3
+    scattering = state.vector.clone()
+    scattering[unknowns.where("modes")] += solver._modes_of_map
+    begin = unknowns.where("amplitude").start
+    step = torch.zeros_like(state.vector)
+    step[begin:] = -change / 2 * scattering[begin:]
+    for frame, part in zip(unknowns.frames, unknowns.rows, strict=True):
+        place = part.rows[frame.where("flux")]
+        step[place] = change * state.vector[place]
+    moved = solver._moved(state, step)
+    assert moved.flux / state.flux == pytest.approx(1 + change)
+    torch.testing.assert_close(
+        moved.vector[begin:] - state.vector[begin:] + scattering[begin:],
+        scattering[begin:] / np.sqrt(1 + change),
+    )
+    # A short step is as long as it was.
+    short = solver._moved(state, 1e-3 * step).vector - state.vector
+    torch.testing.assert_close(short, 1e-3 * step, rtol=1e-3, atol=1e-12)
+
+
 def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner():
     """And end without a step where there is nothing to gain."""
     rng = np.random.default_rng(9)

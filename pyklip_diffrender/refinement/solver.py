@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,8 @@ from pyklip_diffrender.linear.model import (
     LinearModel,
     Noise,
 )
-from pyklip_diffrender.linear.response import ResponseCache
+from pyklip_diffrender.linear.response import NANOMETRE, ResponseCache
+from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.refinement.accurate_steps import ModelDerivatives, accurate_step
 from pyklip_diffrender.refinement.equations import EquationsCache, NormalEquations
 from pyklip_diffrender.refinement.forward import (
@@ -37,7 +39,7 @@ from pyklip_diffrender.refinement.forward import (
 from pyklip_diffrender.refinement.settings import FitSettings, ModePriors
 from pyklip_diffrender.refinement.start import first_unknowns
 from pyklip_diffrender.refinement.unknowns import Unknowns
-from pyklip_diffrender.wavefront.bases import Basis
+from pyklip_diffrender.wavefront.bases import Basis, coefficients_of
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_evidence
 
 _MOST_ATTEMPTS = 7
@@ -78,6 +80,9 @@ _FAR_KAPPA = 0.03
 
 _STEP_PARTS = (1.0, 0.4, 0.16, 0.064)
 """Parts of an accurate step that are tried until one lowers the penalised chi-squared."""
+
+_MAP_SAMPLES = 128
+"""Samples across the pupil of the starting map, to which modes are fitted."""
 
 _SLOW_GAIN_RATIO = 0.8
 """Ratio of the gains of successive steps with the same derivatives above which they are poor: with
@@ -287,7 +292,18 @@ class Solver:
 
     def _moved(self, state: State, step: Tensor) -> State:
         """The state after a step of the leading unknowns, within the bounds of all parameters."""
-        return self.objective.at(state.unknowns, state.unknowns.stepped(state.vector, step))
+        unknowns = state.unknowns
+        return self.objective.at(unknowns, unknowns.stepped(state.vector, step, self._modes_of_map))
+
+    @cached_property
+    def _modes_of_map(self) -> Tensor:
+        """Coefficients of the starting map, (modes,), nm."""
+        problem = self.objective.forwards[0].problem
+        if not problem.initial.data.any():
+            return torch.zeros(len(self.basis), dtype=torch.float64)
+        grid = PupilGrid.full(_MAP_SAMPLES, problem.model.diameter)
+        opd = torch.from_numpy(resample(problem.initial.data, _MAP_SAMPLES)) / NANOMETRE
+        return coefficients_of(opd[None], self.basis, grid)[0]
 
     def leave_out(self, pixels: Sequence[Tensor]) -> None:
         """Leave out pixels from now on; a mask, (ny, nx), for every frame."""

@@ -231,6 +231,23 @@ class JointBasis:
         return total
 
 
+_MODES_RIDGE = 1e-3
+"""Ridge of the fit of modes to maps, relative to the norms of the modes. Modes that are degenerate
+on the mirror share what they explain."""
+
+
+def coefficients_of(maps: Tensor, basis: Basis, grid: PupilGrid) -> Tensor:
+    """Coefficients, (maps, modes), of OPD maps, (maps, rows, columns), that are 0 outside a mirror.
+
+    They have the unit of the maps.
+    """
+    lit = (maps != 0).any(dim=0)
+    inside = basis.modes(grid, 0, len(basis))[:, lit]
+    system = inside @ inside.T
+    system.diagonal().mul_(1 + _MODES_RIDGE)
+    return torch.linalg.solve(system, inside @ maps[:, lit].T).T
+
+
 def fourier_part(basis: Basis) -> tuple[int, FourierModes] | None:
     """Return the last modes of a basis, if they are Fourier modes, and the number before them."""
     last = basis.parts[-1] if isinstance(basis, JointBasis) else basis

@@ -21,7 +21,7 @@ from torch import Tensor
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.units import set_numbers, to_metres, to_number
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, resample
-from pyklip_diffrender.wavefront.bases import Basis
+from pyklip_diffrender.wavefront.bases import Basis, coefficients_of
 
 _CURVATURE_ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
@@ -30,10 +30,6 @@ _SCALE_LIMITS = (1e-4, 100.0)
 """Smallest and largest scale. Without a floor, a group without any signal ends in a division by
 zero; without a ceiling, a bright companion that is missing from the model makes the prior so wide
 that the equations cannot be solved."""
-
-_MODES_RIDGE = 1e-3
-"""Ridge of the fit of modes to maps, relative to the norms of the modes. Modes that are degenerate
-on the mirror share what they explain."""
 
 _FEWEST_DETERMINED_MODES = 20.0
 """Smallest number of determined modes that constrain the scale of a group."""
@@ -195,12 +191,8 @@ def learn_prior(
     changes = np.diff(stack, axis=0) * 1e9
     grid = PupilGrid.full(npix, diameter)
     averaged = np.stack([resample(change, npix) for change in changes])
-    lit = torch.from_numpy(np.abs(averaged).max(axis=0) > 0)
-    inside = basis.modes(grid, 0, len(basis))[:, lit]
-    system = inside @ inside.T
-    system.diagonal().mul_(1 + _MODES_RIDGE)
-    right = inside @ torch.from_numpy(averaged)[:, lit].T
-    coefficients = torch.linalg.solve(system, right).square().mean(dim=1).sqrt().numpy()
+    fitted = coefficients_of(torch.from_numpy(averaged), basis, grid)
+    coefficients = fitted.square().mean(dim=0).sqrt().numpy()
     frequency, group = basis.frequencies.numpy(), basis.group_index.numpy()
 
     # A coefficient c with the deviation s has -log p = log s + c^2 / 2 s^2, up to a constant; s is
