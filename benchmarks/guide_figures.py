@@ -224,27 +224,19 @@ def survey_figure() -> Figure:
 
 
 def time_figure() -> Figure:
-    """How the time of a fit and of a survey grows, from two benchmarks' tables."""
-    growth = Table.read(RESULTS / "growth.ecsv")
-    survey = Table.read(RESULTS / "survey_growth.ecsv")
-    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for k, name in enumerate(dict.fromkeys(map(str, growth["size"]))):
-        rows = growth[growth["size"] == name]
-        size = rows["value"] / rows["value"][0]
-        left.loglog(size, rows["fit"], f"C{k}o-", label=f"{name} from {rows['value'][0]:g}")
-        left.loglog(size, rows["counted"], f"C{k}--", lw=1)
-    left.plot([], [], "k--", lw=1, label="counted operations")
-    left.set(xlabel="size over the smallest", ylabel="processor time of a fit (s)")
-    left.legend(frameon=False, fontsize=8)
-    simulated = survey[survey["kind"] == "simulated"]
-    for k, workers in enumerate(dict.fromkeys(map(int, simulated["workers"]))):
-        rows = simulated[simulated["workers"] == workers]
-        right.loglog(rows["stars"], rows["seconds"], f"C{k}-", label=f"{workers}")
-        done = survey[(survey["kind"] == "measured") & (survey["workers"] == workers)]
-        right.plot(done["stars"], done["seconds"], f"C{k}o")
-    right.set(xlabel="reductions of a survey", ylabel="wall time (s)")
-    right.legend(title="workers", frameon=False, fontsize=8)
+    """How times grow, from the table of `benchmarks.speed`."""
+    table = Table.read(RESULTS / "performance.ecsv")
+    figure = Figure(figsize=(6.5, 4), layout="constrained")
+    ax = figure.subplots()
+    for name in dict.fromkeys(map(str, table["row"])):
+        if not name.startswith("scaling"):
+            continue
+        rows = table[table["row"] == name]
+        label = name.removeprefix("scaling: ").replace("forward", "image")
+        size = rows["size"] / rows["size"][0]
+        ax.loglog(size, rows["seconds"] / rows["seconds"][0], "o-", label=label)
+    ax.set(xlabel="size over the smallest", ylabel="time over that of the smallest")
+    ax.legend(frameon=False, fontsize=8)
     return figure
 
 

@@ -52,7 +52,7 @@ mirrors are corrected every 29 to 36 days on average (JWST User Documentation, "
 and Stability"), and maps of 2022-07-30 and 2022-08-11 differ by 45 nm. A prior that is too wide is
 narrowed. From one that is too narrow a fit ends with a star that is too bright, and stays there
 when the prior is widened: by 1.9 in frames of stpsf in F210M after a change of 38 nm, where this
-prior leads to 1.2 to 1.4."""
+prior leads to 0.8 to 0.9."""
 
 
 def age_of_map(days: float | None) -> float:

@@ -293,7 +293,9 @@ class Solver:
     def _moved(self, state: State, step: Tensor) -> State:
         """The state after a step of the leading unknowns, within the bounds of all parameters."""
         unknowns = state.unknowns
-        return self.objective.at(unknowns, unknowns.stepped(state.vector, step, self._modes_of_map))
+        has_modes = len(step) > unknowns.where("amplitude").start
+        of_map = self._modes_of_map if has_modes else None
+        return self.objective.at(unknowns, unknowns.stepped(state.vector, step, of_map))
 
     @cached_property
     def _modes_of_map(self) -> Tensor:

@@ -268,10 +268,10 @@ class Unknowns:
     #
     # With the second, fits of two rolls in F210M need 15 steps in place of 24.
 
-    def stepped(self, vector: Tensor, step: Tensor, of_map: Tensor) -> Tensor:
+    def stepped(self, vector: Tensor, step: Tensor, of_map: Tensor | None) -> Tensor:
         """The vector after a step of the leading unknowns, within the bounds of all parameters.
 
-        `of_map` has the coefficients of the starting map, (modes,).
+        `of_map` has the coefficients of the starting map, (modes,), if the step has any modes.
         """
         moved = vector.clone()
         moved[: len(step)] += step
@@ -283,7 +283,7 @@ class Unknowns:
             moved[contrasts] = (moved[contrasts] + change * vector[contrasts]) / (1 + change)
         scattering = slice(self.where("amplitude").start, len(step))
         change = self._change_of_flux(vector, moved, range(len(self.frames)))
-        if change is not None and scattering.start < scattering.stop:
+        if change is not None and of_map is not None:
             map_part = torch.zeros_like(vector)
             map_part[self.where("modes")] = of_map
             whole = (vector + map_part)[scattering]
