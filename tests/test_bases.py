@@ -112,6 +112,11 @@ def test_coefficients_of_maps_make_these_maps_on_the_mirror():
     for found, opd in zip(fitted, maps, strict=True):
         residual = (JOINT.opd(found, GRID) - opd)[lit]
         assert float(residual.norm() / opd[lit].norm()) < 0.02
+    # A segment without a map has no motions.
+    maps[:, support(4) > 0] = 0.0
+    alone = coefficients_of(maps, SEGMENTS, GRID)
+    assert not alone[:, 12:15].any()
+    assert alone[:, :12].all()
 
 
 def test_the_joint_basis_keeps_kinds_apart():

@@ -235,16 +235,23 @@ _MODES_RIDGE = 1e-3
 """Ridge of the fit of modes to maps, relative to the norms of the modes. Modes that are degenerate
 on the mirror share what they explain."""
 
+_MODES_AT_A_TIME = 256
+"""Modes that are sampled at a time."""
+
 
 def coefficients_of(maps: Tensor, basis: Basis, grid: PupilGrid) -> Tensor:
     """Coefficients, (maps, modes), of OPD maps, (maps, rows, columns), that are 0 outside a mirror.
 
-    They have the unit of the maps.
+    They have the unit of the maps, and are 0 for modes of segments where all maps are 0.
     """
     lit = (maps != 0).any(dim=0)
-    inside = basis.modes(grid, 0, len(basis))[:, lit]
+    starts = range(0, len(basis), _MODES_AT_A_TIME)
+    stops = [min(start + _MODES_AT_A_TIME, len(basis)) for start in starts]
+    parts = [basis.modes(grid, *each)[:, lit] for each in zip(starts, stops, strict=True)]
+    inside = torch.cat(parts)
     system = inside @ inside.T
-    system.diagonal().mul_(1 + _MODES_RIDGE)
+    diagonal = system.diagonal()
+    diagonal.copy_(torch.where(diagonal > 0, (1 + _MODES_RIDGE) * diagonal, 1.0))
     return torch.linalg.solve(system, inside @ maps[:, lit].T).T
 
 
