@@ -2,7 +2,7 @@
 
 Every scenario runs a survey of cheap jobs as real processes, breaks something, and requires that
 no folder is half a product, that finished jobs are kept, and that there is a message. The tests of
-surveys run the scenarios. Scenarios that need a mounted disk raise PermissionError where mounting
+surveys run the scenarios. Scenarios that need a mounted disk raise MountingRefused where mounting
 is not allowed.
 """
 
@@ -39,6 +39,10 @@ DEADLINE = 300.0
 
 
 # -- cheap jobs ------------------------------------------------------------------------------------
+
+
+class MountingRefused(PermissionError):
+    """This process may not mount disks."""
 
 
 def part(key: str, k: int) -> bytes:
@@ -205,13 +209,13 @@ def disk(path: Path, size: str) -> Iterator[None]:
 
     Raises
     ------
-    PermissionError
+    MountingRefused
         Where mounting is not allowed.
     """
     path.mkdir(parents=True)
     command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(path)]
     if subprocess.run(command, capture_output=True, check=False).returncode:
-        raise PermissionError("mounting is not allowed")
+        raise MountingRefused("mounting is not allowed")
     try:
         yield
     finally:
@@ -414,7 +418,7 @@ def scheduler_killed(folder: Path, *_: int) -> str:
 def blind_worker(folder: Path, *_: int) -> str:
     """A worker elsewhere that sees the output, but not the data; then one that sees neither."""
     if subprocess.run(["unshare", "-m", "true"], capture_output=True, check=False).returncode:
-        raise PermissionError("mounting is not allowed")
+        raise MountingRefused("mounting is not allowed")
     trial = Trial(folder)
     (trial.output / "jobs").mkdir(parents=True)
     words = ["does not see this file", "does not see this folder"]

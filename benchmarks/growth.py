@@ -1,13 +1,12 @@
-"""How the time of a fit and of a search grows, beside a count of their operations.
+"""How the time of a fit grows, beside a count of its operations.
 
     python -m benchmarks.growth --output docs/results/growth.ecsv
 
 Made stars in F444W behind MASK335R, whose wavefront has drifted for 4 h since the map. From one
 frame of 80 x 80 pixels, modes to 12 cycles and 4 wavelengths, one size changes at a time. All fits
-take the same number of steps, so that the time of a step is compared, and all searches are without
-candidates. In the same process are measured the processor time of one thread for the fit and for
-the search, and the rates of products of real and of complex matrices, by which the counted
-operations become seconds:
+take the same number of steps, so that the time of a step is compared. In the same process are
+measured the processor time of one thread, and the rates of products of real and of complex
+matrices, by which the counted operations become seconds:
 
 - The normal equations of u unknowns of a frame with p pixels, of which one triangle is computed:
   u^2 p.
@@ -15,8 +14,8 @@ operations become seconds:
   wavelength, by a product of matrices: 8 (k^2 n + k n^2), for each image of the star, and for the
   derivatives by each mode.
 
-Both are counted as often as the fit needs them. Not counted are the occulter, the derivatives of
-the image by the other parameters, and the search.
+Both are counted as often as the fit needs them. Not counted are the occulter and the derivatives of
+the image by the other parameters.
 """
 
 from __future__ import annotations
@@ -54,8 +53,6 @@ DRIFT_HOURS = 4.0
 PUPIL_SAMPLES = 512
 RESPONSE_SAMPLES = 128
 MATRIX_SIZE = 1024
-NO_CANDIDATES = 1e3
-"""S/N of a candidate that no peak reaches."""
 
 
 class Count(logging.Handler):
@@ -122,7 +119,7 @@ def rate(dtype: torch.dtype) -> float:
 
 
 def measured(pixels: float, cycles: float, wavelengths: float, frames: float) -> dict[str, float]:
-    """Processor times and counted operations of one fit and its search."""
+    """Processor time and counted operations of one fit."""
     model = dr.nircam_coronagraph(
         "F444W", npix=PUPIL_SAMPLES, fov_pixels=int(pixels), nlambda=int(wavelengths)
     )
@@ -137,9 +134,8 @@ def measured(pixels: float, cycles: float, wavelengths: float, frames: float) ->
     count = Count(model, min(int(wavelengths), settings.response_wavelengths))
     with count.counting():
         fit_seconds, fit = seconds(lambda: dr.refine(model, observed, start, settings=settings))
-    search_seconds, _ = seconds(lambda: dr.detect(fit, threshold=NO_CANDIDATES))
     return {
-        "unknowns": len(fit.linear.unknowns), "fit": fit_seconds, "search": search_seconds,
+        "unknowns": len(fit.linear.unknowns), "fit": fit_seconds,
         "normal": count.normal, "transforms": count.transforms,
     }  # fmt: skip
 
@@ -156,9 +152,9 @@ def table_of(sizes: dict[str, tuple[float, ...]]) -> Table:
             print(rows[-1], flush=True)
     table = Table(rows)
     table["over_counted"] = table["fit"] / table["counted"]
-    for name in ("fit", "search", "counted"):
+    for name in ("fit", "counted"):
         table[name].unit = "s"
-    for name in ("fit", "search", "counted", "over_counted"):
+    for name in ("fit", "counted", "over_counted"):
         table[name].format = ".3g"
     table["fit"].description = "processor time of one thread"
     table["counted"].description = "counted operations over the rate of a product of matrices"
@@ -177,7 +173,7 @@ def main() -> None:
     table.meta = provenance("benchmarks.growth --output FILE")
     for name in sizes:
         rows = table[table["size"] == name]
-        for part in ("fit", "search", "counted"):
+        for part in ("fit", "counted"):
             power = exponent(np.asarray(rows["value"]), np.asarray(rows[part]))
             table.meta[f"exponent of {part} in {name}"] = round(float(power), 2)
     table.pprint_all()

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.refinement.accurate_steps import ModelDerivatives, conjugate_gradients
 from pyklip_diffrender.refinement.equations import linearise
@@ -253,6 +254,12 @@ def test_a_long_step_of_flux_and_wavefront_stays_in_the_same_light():
     unknowns, change = state.unknowns, 0.3
     scattering = state.vector.clone()
     scattering[unknowns.where("modes")] += solver._modes_of_map
+    problem = solver.objective.forwards[0].problem
+    grid = PupilGrid.full(NPIX, problem.model.diameter)
+    opd = torch.from_numpy(problem.initial.data)
+    found = 1e-9 * BASIS.opd(solver._modes_of_map, grid)
+    # What the few modes of this basis have of the map.
+    assert 0.3 < float((opd * found).sum() / opd.square().sum()) < 1
     begin = unknowns.where("amplitude").start
     step = torch.zeros_like(state.vector)
     step[begin:] = -change / 2 * scattering[begin:]
