@@ -466,8 +466,8 @@ class Annealing:
     def _count_on_the_way(self, course: Course) -> None:
         """Make the flux marginal once the model error is the last one.
 
-        The most probable flux and wavefront, found together, are a star that is too bright, from
-        which a fit does not come back: in F210M, of a star with a map of 104 days, 1.6 times.
+        Until then the most probable flux and wavefront are found together, and the star becomes
+        brighter with every step, which later steps would have to take back.
         """
         is_last = course.kappa <= self.settings.min_model_error and course.modes > 0
         if is_last and not course.carried.priors.determined:

@@ -50,9 +50,8 @@ _OLDER_MAP_RATIO = 2.0
 """Ratio of the prior's scales for an older map to the preset's: 51 nm rms in place of 26. The
 mirrors are corrected every 29 to 36 days on average (JWST User Documentation, "Optics Performance
 and Stability"), and maps of 2022-07-30 and 2022-08-11 differ by 45 nm. A prior that is too wide is
-narrowed. From one that is too narrow a fit ends with a star that is too bright, and stays there
-when the prior is widened: by 1.9 in frames of stpsf in F210M after a change of 38 nm, where this
-prior leads to 0.8 to 0.9."""
+narrowed. In frames of stpsf in F210M after a change of 38 nm, stars come out 0.8 times as bright
+with either; before steps were taken in the star's light, the preset's led to 1.9 times."""
 
 
 def age_of_map(days: float | None) -> float:
