@@ -12,7 +12,6 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.refinement import FitSettings, Status, refine_again
-from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior, default_basis, random_opd
 
@@ -67,21 +66,6 @@ def shot(k=0, planet=None, cycles=CYCLES[0]):
 
 def settings(**changes):
     return FitSettings(**{"cycles": CYCLES, "response_npix": 64, **changes})
-
-
-def test_the_flux_is_marginal_before_the_wavefront_has_settled(monkeypatch):
-    """Found together with the wavefront, the star becomes brighter with every step."""
-    counted, original = [], Annealing._counted
-
-    def recorded(annealing, end):
-        counted.append(len(annealing.history))
-        return original(annealing, end)
-
-    monkeypatch.setattr(Annealing, "_counted", recorded)
-    fit = dr.refine(model(), shot(), before(), settings=settings(marginal_flux=True))
-    assert fit.status is Status.CONVERGED
-    first = next(k for k, each in enumerate(fit.history, 1) if each["kappa"] == 0)
-    assert counted[0] == first < len(fit.history)
 
 
 @pytest.mark.parametrize(

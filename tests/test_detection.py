@@ -28,7 +28,6 @@ from pyklip_diffrender.refinement import Status, annealing, fitting, refine_agai
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.scene import Planet, world_coordinates
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.opd import as_opd_map
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 FLUX = 3e11
@@ -208,22 +207,6 @@ def test_a_rough_fit_that_does_not_explain_its_data_goes_on(world, monkeypatch):
     assert (rough.status, fine.status) == (Status.MODEL_MISMATCH, Status.CONVERGED)
     assert fine.history[: len(rough.history)] == rough.history
     assert len(fine.history) > len(rough.history)
-
-
-def test_the_prior_is_wider_for_an_older_map(world):
-    observation = replace(world.observed(world.expected(), 4), date=Time("2023-01-01"))
-    prior = WavefrontPrior({"segment": 1.0, "texture": 0.1}, fit_scales=False)
-
-    def start(days, **changes):
-        opd = replace(as_opd_map(world.opd), date=Time("2023-01-01") - days * u.day)
-        settings = dr.FitSettings(basis=world.basis, prior=prior, max_iterations=1, **changes)
-        return dr.refine(world.model, observation, opd, settings=settings).settings.prior.scales
-
-    assert start(50, adapt_prior=True) == prior.scales
-    # Twice as wide, for all modes alike.
-    assert start(104, adapt_prior=True) == pytest.approx({"segment": 2.0, "texture": 0.2})
-    assert start(-104, adapt_prior=True) == pytest.approx({"segment": 2.0, "texture": 0.2})
-    assert start(104) == prior.scales
 
 
 def test_the_prior_of_the_amplitude_is_widened_as_well(world):

@@ -190,10 +190,6 @@ def _rules_of_a_fit() -> list[Breakage]:
             "if not priors.determined:", "if True:", "gradient",
         ),
         Breakage(
-            "rule-count-early", "the flux is marginal as soon as the model error is the last one",
-            "if is_last and not course.carried.priors.determined:", "if False:", "continuation",
-        ),
-        Breakage(
             "step-in-light", "a long step of flux and wavefront stays in the same light",
             "change / 2 * whole", "change / 2 * 0", "gradient",
         ),
@@ -201,10 +197,6 @@ def _rules_of_a_fit() -> list[Breakage]:
             "rule-finer", "a rough fit that does not explain its data goes on",
             "settings.tolerance > _FINER_TOLERANCE and fit.status is Status.MODEL_MISMATCH",
             "False", "detection",
-        ),
-        Breakage(
-            "rule-old-map", "the prior is wider for an old map",
-            "if not self.adapt_prior or age_of_map(days) <= 1:", "if True:", "detection",
         ),
         Breakage(
             "rule-widen-early", "a fit that goes on widens its prior on the way",

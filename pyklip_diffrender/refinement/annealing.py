@@ -258,8 +258,6 @@ class Annealing:
                 priors = course.carried.priors
                 if self._is_warm and not self._has_scales:
                     self._measure_on_the_way(course, gain)
-                elif not self._has_scales:
-                    self._count_on_the_way(course)
                 settled = (self._anneal if course.modes else self._align)(course, gain)
                 # With other priors a step may gain more than the last one did.
                 converged = settled and course.carried.priors is priors
@@ -462,16 +460,6 @@ class Annealing:
                 break
         _log.info("the wavefront is larger than its prior says, which is now %s", settings.prior)
         return settings
-
-    def _count_on_the_way(self, course: Course) -> None:
-        """Make the flux marginal once the model error is the last one.
-
-        Until then the most probable flux and wavefront are found together, and the star becomes
-        brighter with every step, which later steps would have to take back.
-        """
-        is_last = course.kappa <= self.settings.min_model_error and course.modes > 0
-        if is_last and not course.carried.priors.determined:
-            course.carried = self._counted(self._end_of(course)).carried
 
     def _measure_on_the_way(self, course: Course, gain: float) -> None:
         """Measure priors early, and once more, without bad pixels, where steps gain little.

@@ -339,8 +339,6 @@ def refine(
         for each in observations:
             require_pattern_of(pattern, each)
     wavefront = as_opd_map(opd)
-    date = observations[0].date
-    adapted = adapted.for_map_of_age(None if date is None else wavefront.days_after(date))
     problems = [
         Problem(model, each, wavefront, starting_values(model, each, begin), pattern)
         for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)

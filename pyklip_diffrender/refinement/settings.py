@@ -46,13 +46,6 @@ _CURRENT_MAP_DAYS = 60.0
 """Days between map and frames up to which the scales of the preset hold: in the real frames with
 which they were measured, 50."""
 
-_OLDER_MAP_RATIO = 2.0
-"""Ratio of the prior's scales for an older map to the preset's: 51 nm rms in place of 26. The
-mirrors are corrected every 29 to 36 days on average (JWST User Documentation, "Optics Performance
-and Stability"), and maps of 2022-07-30 and 2022-08-11 differ by 45 nm. A prior that is too wide is
-narrowed. In frames of stpsf in F210M after a change of 38 nm, stars come out 0.8 times as bright
-with either; before steps were taken in the star's light, the preset's led to 1.9 times."""
-
 
 def age_of_map(days: float | None) -> float:
     """Time between map and frames as a fraction of `_CURRENT_MAP_DAYS`; 0 if it is not known."""
@@ -294,17 +287,6 @@ class FitSettings:
             return math.inf
         # Some of what is freed does not return to the system at once.
         return max(0.0, 0.9 * self.memory - _PROCESS_BYTES - arrays)
-
-    def for_map_of_age(self, days: float | None) -> FitSettings:
-        """Return settings for a map that was sensed so many days before or after the frames.
-
-        The prior is wider for an old map. The settings do not change for a map of unknown age, or
-        if `adapt_prior` is False.
-        """
-        if not self.adapt_prior or age_of_map(days) <= 1:
-            return self
-        ratios = dict.fromkeys(self.prior.scales, _OLDER_MAP_RATIO)
-        return replace(self, prior=self.prior.widened(ratios))
 
     def with_wider_priors(self, ratios: Mapping[str, float]) -> FitSettings:
         """Return settings whose priors have scales multiplied by ratios above 1.
