@@ -160,8 +160,6 @@ def test_arguments_that_do_not_go_together_are_refused():
     frames = [shot(0), shot(1)]
     with pytest.raises(IncompatibleSetupError, match=r"settings: got a str, expected FitSettings"):
         dr.refine(model(), frames, before(), settings="gauss-newton")
-    with pytest.raises(ValueError, match=r"start: got 3 dicts for 2 observations"):
-        dr.refine(model(), frames, before(), start=[{}, {}, {}])
     with pytest.raises(IncompatibleSetupError, match="order of the arguments"):
         dr.refine(before(), shot(), model())
 

@@ -16,6 +16,7 @@ from pyklip_diffrender.bridges import from_poppy
 from pyklip_diffrender.bridges.sampled_planes import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
 from pyklip_diffrender.linear import ResponseCache
+from pyklip_diffrender.linear.response import Reading
 from pyklip_diffrender.refinement import FitSettings, Refinement
 from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.refinement.solver import Solver
@@ -129,7 +130,7 @@ def response(device, **changes):
     model = model_on(device, **changes)
     values = {name: value.cpu() for name, value in tensors(model).items()}
     start = torch.as_tensor(opd(), device=device)
-    responses = ResponseCache(model, BASIS, npix=NPIX // 2)
+    responses = Reading(ResponseCache(model, BASIS, npix=NPIX // 2), 0.05, 1, is_last=False)
     with torch.no_grad():
         fields = model.fields(start, **values)
     names = ("star_offset", "lyot_shift", "blur")

@@ -11,7 +11,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.refinement.accurate_steps import ModelDerivatives, conjugate_gradients
-from pyklip_diffrender.refinement.equations import linearise
+from pyklip_diffrender.refinement.equations import EquationsCache
 from pyklip_diffrender.refinement.forward import Forward, FrameDerivatives, Problem, allowance
 from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.scene import DetectorPattern
@@ -59,7 +59,7 @@ def gradient(solver, state, *, exact):
     if exact:
         weights = solver.objective.errors(state, 0.01, 4.0)
         return ModelDerivatives(solver.objective, state, weights).gradient()
-    equations = linearise(solver.objective, state, 0.01, len(BASIS), 4.0)
+    equations = solver.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
     return equations.gradient - equations.curvature @ equations.current
 
 
@@ -147,7 +147,7 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy():
     curved, products = [], []
     for each in (solver, of_the_model_itself(solver)):
         weights = each.objective.errors(state, 0.01, 4.0)
-        equations = linearise(each.objective, state, 0.01, len(BASIS), 4.0)
+        equations = each.equations.about(state, 0.01, len(BASIS), 4.0, 0.05)
         curved.append(unit * ModelDerivatives(each.objective, state, weights).product(step))
         products.append(unit * (equations.curvature @ step))
     coarse, expected = products
@@ -170,7 +170,8 @@ def test_derivatives_at_the_same_state_are_used_again(monkeypatch):
     unknowns, vector = state.unknowns, state.vector
     added = unknowns.with_companions([dr.Planet(3e-5, 0.4, 20.0)], vector)
     later, moved = solver.objective.at(*added), solver.objective.at(unknowns, 1.01 * vector)
-    expected = linearise(solver.objective, later, *arguments)
+    fresh = EquationsCache(solver.objective, solver.objective.forwards[0].responses)
+    expected = fresh.about(later, *arguments, 0.05)
     computed, compute = [], FrameDerivatives.at.__func__
 
     def counted(cls, forward, *others):

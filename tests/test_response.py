@@ -18,6 +18,7 @@ from pyklip_diffrender.linear import (
     coarse_copy,
     downsample,
 )
+from pyklip_diffrender.linear.response import Reading
 from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.wavefront import (
@@ -108,11 +109,12 @@ def test_responses_that_are_not_stored_are_the_same():
     """Room for one response: the other is computed again, about its own wavefront."""
     model, start, basis = system(npix=64), downsample(OPD, 64), FourierModes(3)
     fields = model.fields(start, **VALUES)
-    last = ResponseCache(model, basis, npix=64).reading(is_last=True)
+    last = Reading(ResponseCache(model, basis, npix=64), 0.05, 1, is_last=True)
     assert not last.near(start, VALUES).stored
     every = []
     for memory in (math.inf, 8 * len(basis) * 20 * 24, 100.0):
-        responses = ResponseCache(model, basis, npix=64, keep=2, memory=memory)
+        cache = ResponseCache(model, basis, npix=64, memory=memory)
+        responses = Reading(cache, 0.05, 2, is_last=False)
         places = (start, start + 2e-7 * model.entrance.lit)
         near, far = (responses.near(opd, VALUES) for opd in places)
         assert responses.near(start, VALUES) is near

@@ -17,16 +17,14 @@ then stands for J C^-1 J^T, with the derivatives J that are not whitened.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-
-from pyklip_diffrender.errors import ShapeError
 
 _PIXELS_AT_A_TIME = 1024
 """Number of pixels that are processed at a time, in arrays with a number for every unknown."""
@@ -182,10 +180,7 @@ class Noise:
 
     def weighted(self, images: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """C^-1 x of images x, as `inverse`."""
-        if self.shares_pattern:
-            inverse = self.inverse(images)
-            return {k: self.weight[k].to(x.dtype) * x for k, x in inverse.items()}
-        return {k: (self.weight[k] ** 2).to(x.dtype) * x for k, x in images.items()}
+        return {k: self.weight[k].to(x.dtype) * x for k, x in self.inverse(images).items()}
 
     def whitened(self, images: Mapping[int, Tensor]) -> Tensor:
         """Images in units in which their noise is independent and has a variance of 1.
@@ -297,10 +292,6 @@ class LinearModel:
             f"<LinearModel: {len(self.unknowns)} unknowns, {len(self.frames)} x {ny} x {nx} pixels>"
         )
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Cached properties can be computed again, and are larger than the fields.
-        return {each.name: getattr(self, each.name) for each in fields(self)}
-
     @cached_property
     def noise(self) -> Noise:
         """Covariance of the noise of all frames."""
@@ -400,9 +391,6 @@ class LinearModel:
         -------
         Tensor, (unknowns, k), float64
         """
-        count = {len(t) for t in templates.values()}
-        if len(count) != 1:
-            raise ShapeError(f"templates: got {sorted(count)} of them, expected one number")
         return self._solved(self._pulled(templates))
 
     def weigh(self, templates: Mapping[int, Tensor]) -> TemplateProducts:
@@ -419,21 +407,15 @@ class LinearModel:
             The amplitude is numerator / information, with a standard deviation of
             1 / sqrt(information), or 1 / sqrt(photon) if all unknowns were known.
         """
-        parts = []
-        total = len(next(iter(templates.values())))
-        for start in range(0, total, _TEMPLATES_AT_A_TIME):
-            piece = slice(start, start + _TEMPLATES_AT_A_TIME)
-            part = {k: images[piece] for k, images in templates.items()}
-            # By the Woodbury identity p . Sigma^-1 p = p . C^-1 p - |L^-1 G p|^2. The last term is
-            # the part of the template that the unknowns of the star absorb.
-            absorbed = (self.projected(part) ** 2).sum(dim=0)
-            numerator = torch.zeros_like(absorbed)
-            for k, images in part.items():
-                weighted = (images * self.frames[k].weight.to(images.dtype)).double()
-                numerator += torch.tensordot(weighted, self.cleaned[k], dims=2)
-            photon = self.noise.power(part)
-            parts.append(TemplateProducts(numerator, photon - absorbed, photon))
-        return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
+        # By the Woodbury identity p . Sigma^-1 p = p . C^-1 p - |L^-1 G p|^2. The last term is the
+        # part of the template that the unknowns of the star absorb.
+        absorbed = (self.projected(templates) ** 2).sum(dim=0)
+        numerator = torch.zeros_like(absorbed)
+        for k, images in templates.items():
+            weighted = (images * self.frames[k].weight.to(images.dtype)).double()
+            numerator += torch.tensordot(weighted, self.cleaned[k], dims=2)
+        photon = self.noise.power(templates)
+        return TemplateProducts(numerator, photon - absorbed, photon)
 
     def weigh_pixels(self, k: int, places: Tensor) -> TemplateProducts:
         """Amplitudes of light in single pixels of frame k, `places` (n, 2) as y, x; see `weigh`."""

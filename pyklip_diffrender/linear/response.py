@@ -531,9 +531,12 @@ class _About:
 class Reading:
     """Access to the derivatives of a cache that records the largest error of what was taken.
 
-    The cache computes derivatives again where the field has changed by more than `allowed`, and
-    stores `keep` responses, but no new response if this is the last reading (`is_last`). `farthest`
-    is the largest change of the field since the derivatives were computed.
+    The cache computes derivatives again where the field has changed by more than `allowed`
+    (relative, radians for a phase, rms over the pupil), and stores `keep` responses, but no new
+    response if this is the last reading (`is_last`). `farthest` is the largest change of the field
+    since the derivatives were computed. With derivatives that were computed at a distance of 0.2
+    (15 mas in the star's position), the stated error of the star's position is half the true error,
+    and the position is off by four times as much.
     """
 
     def __init__(self, cache: ResponseCache, allowed: float, keep: int, is_last: bool) -> None:
@@ -541,7 +544,10 @@ class Reading:
         self.farthest = 0.0
 
     def near(self, opd: Tensor, values: dict[str, Tensor]) -> WavefrontResponse:
-        """Take the response for nearly the same field, see `ResponseCache.near`."""
+        """Take the response for nearly the same field, see `ResponseCache`.
+
+        The response follows changes in the last pupil, and is right until the next call.
+        """
         response, error = self._cache.response_within(
             opd, values, self._allowed, self._keep, stores=not self._is_last
         )
@@ -555,7 +561,11 @@ class Reading:
         names: tuple[str, ...],
         fields: Sequence[Tensor],
     ) -> Tensor:
-        """Take the derivatives by parameters, (components, ny, nx), see `ResponseCache`."""
+        """Take the derivatives by named parameters, (components, ny, nx).
+
+        `opd` is (npix, npix) on the model's grid, m, and `fields` are the fields of the star at
+        each wavelength. The names must not change between calls.
+        """
         slopes, error = self._cache.slopes_within(opd, values, names, self._allowed, self._keep)
         self.farthest = max(self.farthest, error)
         return self._cache.image_slopes(fields, values, names, slopes)
@@ -576,50 +586,16 @@ class ResponseCache:
         *,
         npix: int = 128,
         wavelengths: int = 4,
-        relinearise: float = 0.05,
-        keep: int = 1,
         memory: float = math.inf,
         progress: bool = False,
     ) -> None:
         self.model, self.basis, self.npix, self.wavelengths = model, basis, npix, wavelengths
-        # `relinearise` is the relative change of the field (radians for a phase), rms over the
-        # pupil, above which derivatives are computed again, unless a `Reading` allows another
-        # change. With derivatives that were computed at a distance of 0.2 (15 mas in the star's
-        # position), the stated error of the star's position is half the true error, and the
-        # position is off by four times as much. Frames differ in the star's position, so that each
-        # frame keeps a response.
-        self._relinearise, self._keep = relinearise, keep
         self.memory, self.progress = memory, progress
         self._kept: list[tuple[_About, WavefrontResponse]] = []
         self._slopes: list[tuple[_About, dict[str, list[Tensor]]]] = []
         self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
         self._coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
         self._last_pupil = LastPupil(self._coarse)
-
-    def reading(
-        self, allowed: float | None = None, keep: int | None = None, *, is_last: bool = False
-    ) -> Reading:
-        """A new `Reading`, perhaps with another allowed error or number of responses."""
-        return Reading(
-            self,
-            self._relinearise if allowed is None else allowed,
-            self._keep if keep is None else keep,
-            is_last,
-        )
-
-    def parameters(
-        self,
-        opd: Tensor,
-        values: dict[str, Tensor],
-        names: tuple[str, ...],
-        fields: Sequence[Tensor],
-    ) -> Tensor:
-        """Derivative of the image with respect to named parameters, (components, ny, nx).
-
-        `opd` is (npix, npix) on the model's grid, m, and `fields` are the fields of the star at
-        each wavelength. The names must not change between calls.
-        """
-        return self.reading().parameters(opd, values, names, fields)
 
     def image_slopes(
         self,
@@ -654,13 +630,6 @@ class ResponseCache:
         slopes = field_derivatives(self._coarse, downsample(opd, self._coarse.npix), values, names)
         self._slopes.append((_About(inside, dict(values), dict(values)), slopes))
         return slopes, 0.0
-
-    def near(self, opd: Tensor, values: dict[str, Tensor]) -> WavefrontResponse:
-        """Return the stored response for nearly the same field, or compute it.
-
-        The response follows changes in the last pupil, and is right until the next call.
-        """
-        return self.reading().near(opd, values)
 
     def response_within(
         self,

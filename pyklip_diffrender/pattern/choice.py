@@ -25,7 +25,12 @@ from pyklip_diffrender.pattern.library import (
     known_pattern,
     package_library,
 )
-from pyklip_diffrender.pattern.measure import flat_of, lacks_pattern, measure_patterns
+from pyklip_diffrender.pattern.measure import (
+    KNOWN_MODEL_ERROR,
+    flat_of,
+    lacks_pattern,
+    measure_patterns,
+)
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import FitSettings, settings_for
@@ -147,10 +152,6 @@ ReferenceFrames: TypeAlias = Sequence[Observation] | Callable[[], Sequence[Obser
 
 Origin: TypeAlias = Literal["none", "off", "given", "library", "references", "rolls"]
 
-
-_KNOWN_MODEL_ERROR = 0.002
-"""Smallest model error, as a fraction of the star, where the pattern is known from other stars: the
-pattern's own error is counted apart."""
 
 _ROUGH_SETTINGS: dict[str, Any] = {
     "min_model_error": 0.05,
@@ -336,7 +337,7 @@ def choose_pattern(
             origin = "none"
         _log.info("detector pattern: %s", chosen)
     if chosen is not None and settings is None and science[0].is_nircam:
-        settings = replace(settings_for(science[0]), min_model_error=_KNOWN_MODEL_ERROR)
+        settings = replace(settings_for(science[0]), min_model_error=KNOWN_MODEL_ERROR)
     settings = _limited(settings, science[0], memory)
     return PatternChoice(
         tuple(science), chosen, settings, tuple(fits), tuple(failed), origin, known
@@ -389,7 +390,7 @@ def _fits_beside(choice: PatternChoice, references: Sequence[Observation]) -> li
 
 def with_known_pattern(settings: FitSettings) -> FitSettings:
     """Settings of a fit whose detector pattern accounts for the largest part of its error."""
-    return replace(settings, min_model_error=min(settings.min_model_error, _KNOWN_MODEL_ERROR))
+    return replace(settings, min_model_error=min(settings.min_model_error, KNOWN_MODEL_ERROR))
 
 
 def _library(request: PatternLibrary | str) -> PatternLibrary:

@@ -28,6 +28,7 @@ from pyklip_diffrender.io.headers import same_name, unknown_name
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.pattern.library import PatternLibrary, known_pattern
 from pyklip_diffrender.pattern.measure import (
+    KNOWN_MODEL_ERROR,
     flat_of,
     measure_patterns,
     pattern_pedestal,
@@ -56,9 +57,6 @@ _Fit = tuple[Refinement, tuple[float, float]]
 
 _MODEL_ERROR_ALONE = 0.01
 """Smallest model error, as a fraction of the star, in the fit of a star without a pattern."""
-
-_MODEL_ERROR_WITH_PATTERN = 0.002
-"""Smallest model error with the pattern of other stars; the pattern's error is counted apart."""
 
 
 def learn_patterns(
@@ -194,7 +192,7 @@ class _Fitter:
         first = epoch.science[0]
         settings = replace(
             self.settings or replace(settings_for(first), max_companions=0),
-            min_model_error=_MODEL_ERROR_ALONE if known is None else _MODEL_ERROR_WITH_PATTERN,
+            min_model_error=_MODEL_ERROR_ALONE if known is None else KNOWN_MODEL_ERROR,
         )
         path = None
         if self.folder is not None:

@@ -30,6 +30,10 @@ from pyklip_diffrender.scene.observation import Observation
 
 Image = NDArray[np.float64]
 
+KNOWN_MODEL_ERROR = 0.002
+"""Smallest model error, as a fraction of the star, where the pattern is known from other stars: the
+pattern's own error is counted apart."""
+
 _RING_WIDTH_PIXELS = 4.0
 """Width in pixels of the rings in which scatters are estimated."""
 

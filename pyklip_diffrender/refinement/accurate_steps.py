@@ -118,15 +118,13 @@ def accurate_step(
     enough: float,
     *,
     volume: Tensor | float = 0.0,
-    iterations: int = _GRADIENT_ITERATIONS,
-    sufficient: float = _GRADIENT_TOLERANCE,
 ) -> tuple[Tensor, bool]:
     """Compute the step (unknowns,) to the minimum of the linearised penalised chi-squared.
 
     `curvature` (some, some) is approximate and by the leading unknowns, the only ones that the step
     changes. `offset` (unknowns,) is from the means of the priors, whose standard deviations are
     `deviation`, and `volume` (some,) is added to the gradient. See `conjugate_gradients` for the
-    flag and the last arguments.
+    flag and for `enough`.
     """
     count = len(curvature)
     # The step s minimises s (A + p) s - 2 s (g - p x0), with the curvature A and gradient g of the
@@ -148,9 +146,7 @@ def accurate_step(
         return torch.cholesky_solve(scaled[:, None], factor)[:, 0]
 
     gradient = derivatives.gradient()[:count] - precision * offset[:count] + volume
-    scaled, settled = conjugate_gradients(
-        product, precondition, unit * gradient, enough, iterations, sufficient
-    )
+    scaled, settled = conjugate_gradients(product, precondition, unit * gradient, enough)
     step[:count] = unit * scaled
     return step, settled
 

@@ -38,7 +38,7 @@ from pyklip_diffrender.refinement.residual import (
     isolated_outliers,
     with_dominant,
 )
-from pyklip_diffrender.refinement.settings import FitSettings, ModePriors, count_modes_below
+from pyklip_diffrender.refinement.settings import FitSettings, ModePriors
 from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.wavefront.bases import Basis
@@ -81,11 +81,6 @@ _EXPLAINED_CHI2 = 1.2
 
 _LAST_MODEL_ERROR = 1e-3
 """Model error, as a fraction of the star, below which annealing ends."""
-
-_FEW_MODES_MODEL_ERROR = 0.01
-"""Model error above which modes up to `_FEW_CYCLES` are sufficient."""
-
-_FEW_CYCLES = 14.0
 
 _NEW_COMPANION_MODEL_ERROR = 0.003
 """Model error below which a new companion has hardly biased the wavefront.
@@ -225,7 +220,6 @@ class Annealing:
         self.problems = list(problems)
         self.solver = Solver(problems, settings, basis, progress)
         self.objective = self.solver.objective
-        self._few_modes = count_modes_below(basis, _FEW_CYCLES)
         self._first = StepState(self.solver.priors_of(settings))
         unknowns = self.solver.first_unknowns(self._first.priors)
         self._begin = self.objective.at(
@@ -287,7 +281,7 @@ class Annealing:
             # A larger kappa would lead away from the solution, and back.
             kappa = settings.min_model_error
         skips_alignment = settings.wavefront and (not settings.free or self._is_warm)
-        modes = self._modes_for(kappa) if skips_alignment else 0
+        modes = self._all_modes if skips_alignment else 0
         return Course(state, state, state, carried, settings, kappa, modes, settings.max_iterations)
 
     def _step(self, course: Course) -> float:
@@ -314,7 +308,7 @@ class Annealing:
             course.state = self._with_companions(course.state, bright)
             return False
         if gain < _ALIGNED_CHI2_GAIN and self.settings.wavefront:
-            course.aligned, course.modes = course.state, self._modes_for(course.kappa)
+            course.aligned, course.modes = course.state, self._all_modes
             # The damping of the alignment does not apply to the wavefront.
             course.carried = course.carried.without_damping()
             return False
@@ -332,7 +326,7 @@ class Annealing:
             self._go_on_without_outliers(course)
             if not course.modes:
                 return False
-        is_last = course.kappa <= floor and course.modes == len(self.basis)
+        is_last = course.kappa <= floor
         if is_last and self._drop_faint(course):
             return False
         if gain < self.settings.tolerance and is_last:
@@ -340,7 +334,6 @@ class Annealing:
         course.kappa = min(_KAPPA_STEP_RATIO * course.kappa, course.error / 2)
         if course.kappa < max(_LAST_MODEL_ERROR, floor):
             course.kappa = floor
-        course.modes = self._modes_for(course.kappa)
         return False
 
     def _go_on_without_outliers(self, course: Course) -> None:
@@ -644,13 +637,6 @@ class Annealing:
             ", damping %.2g",
             record["iteration"], chi2, 100 * error, gain, damping,
         )  # fmt: skip
-
-    def _modes_for(self, kappa: float) -> int:
-        """Number of leading modes to fit while the model error is kappa."""
-        joint_fit = len(self.problems) > 1
-        amplitude = len(self._first.priors.amplitude) > 0
-        fine = kappa <= max(_FEW_MODES_MODEL_ERROR, self.settings.min_model_error)
-        return len(self.basis) if fine or joint_fit or amplitude else self._few_modes
 
     @property
     def _may_add(self) -> bool:

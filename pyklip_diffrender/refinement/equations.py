@@ -15,7 +15,7 @@ from pyklip_diffrender.linear.model import (
     pixel_pieces,
     summed_rows,
 )
-from pyklip_diffrender.linear.response import ResponseCache
+from pyklip_diffrender.linear.response import Reading, ResponseCache
 from pyklip_diffrender.refinement.forward import (
     ACCURATE,
     FrameDerivatives,
@@ -100,12 +100,12 @@ def linearise(
     kappa: float,
     modes: int,
     robust: float,
-    derive: Callable[[int], FrameDerivatives] | None = None,
+    derive: Callable[[int], FrameDerivatives],
 ) -> NormalEquations:
     """Linearise all frames about a state, with its first `modes` modes.
 
-    `derive` gives the derivatives of a frame by its index, by default at the state. A wavefront
-    that drifts between frames needs all modes.
+    `derive` gives the derivatives of a frame by its index. A wavefront that drifts between frames
+    needs all modes.
     """
     size = state.unknowns.with_modes(modes)
     # S_f distributes the rows of frame f onto the unknowns: the row of a leading mode to the shared
@@ -124,11 +124,11 @@ def linearise(
     noise = objective.errors(state, kappa, robust)
     residuals = objective.residuals(state)
     whitened = noise.inverse(dict(enumerate(residuals)))
-    for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
+    for k in range(len(residuals)):
         residual, weight, common = (
             each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k])
         )
-        derived = FrameDerivatives.at(forward, point, modes) if derive is None else derive(k)
+        derived = derive(k)
         derivatives.append(derived)
         rendered = derived.jacobian
         part = state.unknowns.rows[k]
@@ -211,7 +211,7 @@ class EquationsCache:
                     return earlier.with_companions_of(forward, point)
                 del earlier
             # Each response of the last reading is used once, and takes most of the memory.
-            reading = self._responses.reading(enough, keep, is_last=final)
+            reading = Reading(self._responses, enough, keep, is_last=final)
             return FrameDerivatives.at(forward, point, modes, outweighing, reading)
 
         self.last = linearise(self._objective, state, kappa, modes, robust, derive)

@@ -266,16 +266,4 @@ def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
         torch.from_numpy(native_float64(table[key])) for key in ("VECTOR", "MEAN", "DEVIATION")
     )
     curvature = torch.from_numpy(native_float64(hdus["CURVATURE"].data))
-    count = len(unknowns)
-    wrong = curvature.shape != (count, count) or any(
-        len(part.jacobian) != len(part.rows)
-        or (len(part.rows) > 0 and not 0 <= int(part.rows.min()) <= int(part.rows.max()) < count)
-        for part in parts
-    )
-    if wrong:
-        raise CorruptFileError(
-            f"{name}: the parts of the linear model do not go together: {count} unknowns, "
-            f"curvature {tuple(curvature.shape)}, rows {[len(part.rows) for part in parts]}. "
-            "Write the fit again"
-        )
     return LinearModel(unknowns, tuple(parts), vector, mean, deviation, curvature)

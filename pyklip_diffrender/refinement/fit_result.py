@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
@@ -487,10 +487,6 @@ class Refinement:
             f"chi2/pixel {self.chi2_per_pixel:.3g}, {self.seconds:.1f} s>"
         )
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Without what is cached, which can be computed again and is larger than the rest.
-        return {each.name: getattr(self, each.name) for each in fields(self)}
-
     def _repr_html_(self) -> str:
         return html_summary(
             "Refinement",
@@ -513,20 +509,12 @@ class Refinement:
 
     @property
     def wavefront(self) -> Image:
-        """The refined wavefront of the first frame, (npix, npix), m, real; see `absorption`.
+        """The refined wavefront of the first frame, (npix, npix), m, real.
 
         Its samples are the samples of the model's pupil. ``frames[0].opd`` is this wavefront
         together with the absorption.
         """
         return np.array(np.real(self.frames[0].opd))
-
-    @property
-    def absorption(self) -> Image:
-        """Imaginary part of the first frame's wavefront, (npix, npix), m: it dims the pupil.
-
-        0 where the amplitude was not fitted.
-        """
-        return np.array(np.imag(self.frames[0].opd))
 
     @property
     def planets(self) -> tuple[Planet, ...]:

@@ -16,7 +16,6 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     MissingOPDError,
     NoValidPixelsError,
-    ShapeError,
 )
 from pyklip_diffrender.instrument.spectrum import require_star
 from pyklip_diffrender.io.headers import known_number
@@ -257,7 +256,7 @@ def refine(
     opd: Any,
     *,
     settings: FitSettings | None = None,
-    start: Start | Sequence[Start] | None = None,
+    start: Start | None = None,
     pattern: DetectorPattern | None = None,
     progress: bool = False,
 ) -> Refinement:
@@ -277,9 +276,9 @@ def refine(
         resampled to the model's pupil. "flat" stands for a flat wavefront.
     settings : FitSettings, optional
         Default `FitSettings.nircam()` for frames whose header says NIRCam, else `FitSettings()`.
-    start : dict or sequence of dict, optional
-        Starting values by parameter name, for all observations or one by one. "detector_shift"
-        is by default the place of the star in the observation.
+    start : dict, optional
+        Starting values by parameter name, for all observations. "detector_shift" is by default the
+        place of the star in the observation.
     pattern : DetectorPattern, optional
         Known detector pattern of other stars, see `learn_pattern`.
     progress : bool
@@ -340,8 +339,8 @@ def refine(
             require_pattern_of(pattern, each)
     wavefront = as_opd_map(opd)
     problems = [
-        Problem(model, each, wavefront, starting_values(model, each, begin), pattern)
-        for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)
+        Problem(model, each, wavefront, starting_values(model, each, start or {}), pattern)
+        for each in observations
     ]
     with breakdown_explained(observations[0].name):
         return fit_in_stages(problems, adapted, progress=progress)
@@ -365,17 +364,6 @@ def _listed(observation: Any) -> list[Observation]:
     if not listed:
         raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
     return listed
-
-
-def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start]:
-    if start is None or isinstance(start, Mapping):
-        return [start or {}] * count
-    if len(start) != count:
-        raise ShapeError(
-            f"start: got {len(start)} dicts for {count} observations, expected one for each or "
-            "one for all"
-        )
-    return list(start)
 
 
 # The flux of the star: from a fit to Jansky, and from a catalogue into a fit.

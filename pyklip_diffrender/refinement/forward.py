@@ -329,16 +329,13 @@ class Forward:
         star = values.get("star_offset", torch.zeros(2, dtype=torch.float64))
         return {**values, "star_offset": star + offset.to(star.device)}
 
-    def jacobian(
-        self, point: Point, modes: int, kappa: float = 0.0, reading: Reading | None = None
-    ) -> Tensor:
+    def jacobian(self, point: Point, modes: int, kappa: float, reading: Reading) -> Tensor:
         """Derivative of `total`, (unknowns, ny, nx), float32, on the CPU.
 
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront. The
         light of companions that are faint, or that a model error `kappa` outweighs, counts as
         independent of optics and wavefront. `reading` takes the derivatives of the field.
         """
-        reading = self.responses.reading() if reading is None else reading
         unknowns, bright = point.unknowns, point.unknowns.bright_sources(point.vector, kappa)
         levels = self.levels(point, bright)
         count = unknowns.where("companions").stop
@@ -536,15 +533,14 @@ class FrameDerivatives:
         forward: Forward,
         point: Point,
         modes: int,
-        outweighing: float = 0.0,
-        reading: Reading | None = None,
+        outweighing: float,
+        reading: Reading,
     ) -> FrameDerivatives:
         """Derivatives at a point, by its first `modes` modes.
 
         The model error `outweighing` decides which companions count, see `brightest`, and
         `reading` takes the derivatives of the field.
         """
-        reading = forward.responses.reading() if reading is None else reading
         unknowns, vector = point.unknowns, point.vector
         return cls(
             forward.jacobian(point, modes, outweighing, reading),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import stop_is_measured
+from pyklip_diffrender.instrument.masks import is_short_wave, stop_is_measured
 from pyklip_diffrender.io.units import ARCSEC, half_circle, require_positive, to_bytes, to_unit
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
@@ -30,9 +29,6 @@ _FITTED_REACH_PIXELS = 40
 _MOST_CYCLES = 32
 """Highest spatial frequency of the preset: 3,200 modes. Each of them takes a float for every pixel,
 and the time of a step grows with their square."""
-
-_LONG_WAVE_FROM_M = 2.4e-6
-"""m; beyond, NIRCam has its long-wave detectors, whose pixels are twice as wide."""
 
 _SHORT_WAVE_DRIFT = WavefrontPrior(
     scales={"segment": 1.5, "texture": 1.0}, knee=1.0, slope=1.0, fit_scales=False
@@ -111,8 +107,7 @@ class FitSettings:
     cycles : tuple of float
         Highest spatial frequencies of the default basis, in cycles across the pupil. The first
         one is fitted, and the next ones in turn while the data are not explained. Give one where
-        the residual need not be missing modes. While the model error is above a percent of the
-        star, fits of one frame with a known pupil amplitude have modes up to 14 cycles only.
+        the residual need not be missing modes.
     basis : Basis, optional
         Wavefront modes, in place of the default basis: Fourier modes and, for JWST, the motions of
         its segments.
@@ -390,7 +385,7 @@ class FitSettings:
         Raises
         ------
         IncompatibleSetupError
-            For a name that is not one of NIRCam's filters, or a value that a field cannot have.
+            For a filter that does not go with the coronagraph, or a value that a field cannot have.
 
         Examples
         --------
@@ -398,8 +393,8 @@ class FitSettings:
         >>> FitSettings.nircam("F356W", max_iterations=60).cycles
         (22.0,)
         """
-        wavelength = _wavelength("F444W" if filter is None else filter)
-        short = wavelength <= _LONG_WAVE_FROM_M
+        name = "F444W" if filter is None else filter
+        short = is_short_wave(name)
         loose = 1.0 if stop_is_measured(image_mask, short) else 3.0
         preset = cls(
             free=(
@@ -426,7 +421,7 @@ class FitSettings:
             # their contrast in the mean, with it at 1.02.
             marginal_flux=True,
             # Finer modes cost time and leave chi-squared within 3 %.
-            cycles=(_cycles_to_edge(wavelength, reach),),
+            cycles=(_cycles_to_edge(name, reach),),
             drift=_SHORT_WAVE_DRIFT if short else None,
             drift_cycles=12.0,
             deviations={
@@ -507,19 +502,10 @@ def nircam_settings(observation: Observation, **changes: Any) -> FitSettings:
     return FitSettings.nircam(observation.filter, image_mask=mask, **changes)
 
 
-def _wavelength(filter: str) -> float:
-    """Wavelength of a filter of NIRCam by its name, m."""
-    name = re.match(r"F(\d{3})(W2?|M|N)$", filter)
-    if name is None:
-        raise IncompatibleSetupError(
-            f"filter: got {filter!r}, expected the name of one of NIRCam's filters, such as F444W"
-        )
-    return int(name[1]) * 1e-8
-
-
-def _cycles_to_edge(wavelength: float, reach: int) -> float:
+def _cycles_to_edge(filter: str, reach: int) -> float:
     """Spatial frequency that moves light by `reach` pixels of NIRCam, if it is not too high."""
-    pixel = 0.063 if wavelength > _LONG_WAVE_FROM_M else 0.031
+    pixel = 0.031 if is_short_wave(filter) else 0.063
+    wavelength = int(filter[1:4]) * 1e-8
     return float(min(_MOST_CYCLES, int(reach * pixel * ARCSEC * JWST_DIAMETER / wavelength)))
 
 

@@ -157,8 +157,6 @@ class Solver:
             basis,
             npix=settings.response_npix,
             wavelengths=settings.response_wavelengths,
-            relinearise=settings.relinearise,
-            keep=len(problems),
             memory=min(_RESPONSES_BYTES, settings.memory_beside(jacobians)),
             progress=progress,
         )
