@@ -26,7 +26,7 @@ from pyklip_diffrender.detection import (
     wide_field,
     without_blurred_edges,
 )
-from pyklip_diffrender.detection.templates import groups_of
+from pyklip_diffrender.detection.templates import Templates, groups_of
 from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics.grid import resample
@@ -223,6 +223,19 @@ def test_a_frame_of_the_whole_detector_takes_less_than_two_gigabytes(tmp_path):
     *found, peak = map(float, run.stdout.split())
     assert found == pytest.approx([1e-4, -4.2, 5.1], rel=0.1)
     assert peak < 2e6
+
+
+def test_sources_far_from_the_star_are_not_behind_a_bar():
+    """10 arcsec to the left and right of the star, a bar still takes all light of a source."""
+    behind = dr.nircam_coronagraph(
+        "F444W", image_mask="MASKLWB", monochromatic=4.5e-6, npix=256, fov_pixels=24
+    )
+    opd = dr.wavefront.random_opd(1, npix=256)
+    frame = dr.simulate(behind, dr.Scene(STAR), opd, seed=5)
+    settings = dr.FitSettings(wavefront=False, companions_if_stalled=False)
+    fit = dr.refine(behind, frame, opd, settings=settings)
+    clear = fit.frames[0].flux * float(Templates(fit, fit.frames[0]).beyond_mask(0).max())
+    assert WholeFrame(fit.frames[0], frame, 0.0).kernel.max() == pytest.approx(clear, rel=0.1)
 
 
 WHOLE_DETECTOR = """

@@ -41,8 +41,8 @@ and light scattered by the edge of the occulters' substrate appears in the first
 frame."""
 
 _FAR_SOURCE_ARCSEC = 4.0
-"""Separation of the source whose image is taken for all sources far from the star, arcsec. The
-occulter takes less than a percent of its light."""
+"""y from the star, arcsec, of the source whose image all sources far from the star have. The mask
+takes less than a percent of its light: bars extend along x."""
 
 _MATCHED_FILTER_PIXELS = 15
 """Side of that image in the matched filter, pixels."""
@@ -164,7 +164,7 @@ class WholeFrame:
         """Source of contrast 1 far from the star, x, y pixels right of and above the middle."""
         model, values = self.fit.on_pixels(size)
         scale = np.array(model.detector.pixelscale)
-        far = torch.tensor([_FAR_SOURCE_ARCSEC, 0.0], dtype=torch.float64)
+        far = torch.tensor([0.0, _FAR_SOURCE_ARCSEC], dtype=torch.float64)
         values["star_offset"] = far
         values["detector_shift"] = torch.from_numpy(np.array([x, y]) * scale) - far
         with torch.no_grad():
