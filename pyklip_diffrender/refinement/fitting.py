@@ -376,7 +376,7 @@ fits with a star 10 % brighter or fainter explain real frames nearly as well
 
 _FLUX_ERROR_OLD_MAP = 0.3
 """Relative error if the map is too old for the preset's prior: in frames of stpsf whose wavefront
-had changed by 38 nm rms, stars came out 0.8 to 1.4 times as bright as they are, and 1.0 to 2.0
+had changed by 38 nm rms, stars came out 1.0 to 1.5 times as bright as they are, and 1.0 to 2.0
 times in first looks (docs/validation/references.md). Until then the error grows in proportion to
 the age of the map: with one of 50 days, fits of the rolls of G 7-34 alone have a star up to 1.24
 times as bright as fits with the rolls of HIP 17695."""
