@@ -29,7 +29,7 @@ from pyklip_diffrender.detection.candidates import Candidates, Maps
 from pyklip_diffrender.detection.error_factor import Significance
 from pyklip_diffrender.detection.field import separation_of
 from pyklip_diffrender.detection.search import significance_of
-from pyklip_diffrender.detection.templates import groups_of
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.residual import local_maxima
@@ -124,9 +124,9 @@ def blocks(
 
 def judged(fit: Refinement, inner: float = INNER) -> tuple[Maps, Significance, Candidates]:
     """Maps of a fit, what decides on their peaks, and its companions."""
-    maps = Maps(groups_of([fit]))
+    maps = Maps(Templates(fit))
     known = Candidates.of_fit(fit)
-    return maps, significance_of([fit], maps, known.offsets, inner), known
+    return maps, significance_of(maps, known.offsets, inner), known
 
 
 def simulated(fit: Refinement, folder: Path, maps: int, planets: int) -> None:
@@ -231,13 +231,12 @@ def real(paths: Sequence[Path]) -> None:
         snr = maps.snr(maps.without(known))
         table.add_row((path.stem, "negative", *_counts(significance, -snr, known)))
         table.add_row((path.stem, "positive", *_counts(significance, snr, known)))
-        groups = groups_of([fit])
-        templates = groups[0][1]
+        templates = Templates(fit)
         if len(templates.rolls) > 1 and not len(known):
             for k, roll in templates.rolls.items():
                 templates.rolls[k] = -roll
-            turned = Maps(groups)
-            wrong = significance_of([fit], turned, known.offsets, significance.inner)
+            turned = Maps(templates)
+            wrong = significance_of(turned, known.offsets, significance.inner)
             counts = _counts(wrong, turned.snr(), known)
             table.add_row((path.stem, "rolls reversed", *counts))
         table[-1:].pprint_all()
