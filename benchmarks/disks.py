@@ -44,7 +44,7 @@ def klip_of(base: dr.Reduction, sequence: dr.ExposureSequence) -> KlipSubtractio
     """KLIP for the frames as they were taken, with those of all other stars of the sequence."""
     resolution = base.detection.contrast_curve.meta["resolution_arcsec"]
     references = sequence.cutout(SIZE).references
-    templates = Templates(base.fit, base.fit.frames[0])
+    templates = Templates(base.fit)
     return KlipSubtraction(templates, references, resolution, base.sequence.science)
 
 
@@ -136,7 +136,7 @@ def main() -> None:
     sequence = read("HIP17695")
     bare = dr.reduce(replace(sequence, references=()), options.opd)
     # At the same places from the other star, in units of it.
-    images = Templates(bare.fit, bare.fit.frames[0]).at(torch.from_numpy(disk.offsets))
+    images = Templates(bare.fit).at(torch.from_numpy(disk.offsets))
     contrasts = np.asarray(disk.contrasts)
     light = [np.tensordot(contrasts, each.numpy(), 1) for each in images.values()]
     science = tuple(

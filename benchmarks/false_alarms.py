@@ -10,15 +10,13 @@ Run from the root of the project, with fits that `Refinement.write` wrote::
 laws of scatter, and decides with the package's own code: maps with a false candidate, and the part
 of planets that become candidates. `maxima` compares the probability of a false alarm with maps of
 uniform noise that are sampled four times finer than the pixels. `real` counts the maxima of the
-maps of real fits with the sign of the data reversed, with the rolls turned the wrong way, and of
-single rolls of two stars as if they were one, beside the expectation. Finished blocks are kept in
-the output folder and not computed again.
+maps of real fits with the sign of the data reversed, and with the rolls turned the wrong way,
+beside the expectation. Finished blocks are kept in the output folder and not computed again.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -31,7 +29,7 @@ from pyklip_diffrender.detection.candidates import Candidates, Maps
 from pyklip_diffrender.detection.error_factor import Significance
 from pyklip_diffrender.detection.field import separation_of
 from pyklip_diffrender.detection.search import significance_of
-from pyklip_diffrender.detection.templates import groups_of
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.residual import local_maxima
@@ -126,9 +124,9 @@ def blocks(
 
 def judged(fit: Refinement, inner: float = INNER) -> tuple[Maps, Significance, Candidates]:
     """Maps of a fit, what decides on their peaks, and its companions."""
-    maps = Maps(groups_of([fit]))
+    maps = Maps(Templates(fit))
     known = Candidates.of_fit(fit)
-    return maps, significance_of([fit], maps, known.offsets, inner), known
+    return maps, significance_of(maps, known.offsets, inner), known
 
 
 def simulated(fit: Refinement, folder: Path, maps: int, planets: int) -> None:
@@ -233,36 +231,17 @@ def real(paths: Sequence[Path]) -> None:
         snr = maps.snr(maps.without(known))
         table.add_row((path.stem, "negative", *_counts(significance, -snr, known)))
         table.add_row((path.stem, "positive", *_counts(significance, snr, known)))
-        groups = groups_of([fit])
-        templates = groups[0][1]
+        templates = Templates(fit)
         if len(templates.rolls) > 1 and not len(known):
             for k, roll in templates.rolls.items():
                 templates.rolls[k] = -roll
-            turned = Maps(groups)
-            wrong = significance_of([fit], turned, known.offsets, significance.inner)
+            turned = Maps(templates)
+            wrong = significance_of(turned, known.offsets, significance.inner)
             counts = _counts(wrong, turned.snr(), known)
             table.add_row((path.stem, "rolls reversed", *counts))
         table[-1:].pprint_all()
-    for row in _two_stars(paths):
-        table.add_row(row)
     print("maxima and, in brackets, their expectation in Gaussian noise")
     table.pprint_all()
-
-
-def _two_stars(paths: Sequence[Path]) -> Iterator[tuple[str, ...]]:
-    """Rows of the maxima of two stars' single rolls in one filter, searched as if of one star."""
-    known = Candidates.at([], [])
-    read = {path.stem: Refinement.read(path) for path in paths}
-    single = {name: fit for name, fit in read.items() if len(fit.frames) == 1}
-    for names in itertools.combinations(single, 2):
-        fits = [single[name] for name in names]
-        first, second = (fit.frames[0].observation for fit in fits)
-        if first.filter == second.filter and first.target != second.target:
-            maps = Maps(groups_of(fits))
-            significance = significance_of(fits, maps, known.offsets, INNER)
-            name = " ".join(names)
-            yield name, "two stars", *_counts(significance, maps.snr(), known)
-            yield name, "two stars, negative", *_counts(significance, -maps.snr(), known)
 
 
 def _counts(significance: Significance, snr: Image, known: Candidates) -> list[str]:

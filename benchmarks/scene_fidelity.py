@@ -187,7 +187,7 @@ def main() -> None:
         away = np.hypot(*grid[rows, columns].T)
         near = (away > 0.3) & (away < 2.1)
         rows, columns, away = rows[near], columns[near], away[near]
-        images = Templates(fit, fit.frames[0]).at_pixels(rows, columns)
+        images = Templates(fit).at_pixels(rows, columns)
         for factor in (1, 10, 100):
             linear = cut(fainter(fit, floors, factor), size)
             shown = {k: image[:, a:b, a:b] / factor for k, image in images.items()}

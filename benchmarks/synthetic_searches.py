@@ -130,7 +130,7 @@ def made(
     )
     count = len(sources)
     detection = Detection(
-        fits=(), groups=(), contrast=snr * errors, error=errors, photon_error=errors, snr=snr,
+        stored_fit=None, contrast=snr * errors, error=errors, photon_error=errors, snr=snr,
         residual_snr=residual,
         error_factor=measured if np.isfinite(freedoms).all() else constant,
         sources=sources, false_alarm=np.zeros(count), rings=QTable(), threshold=5.0,
@@ -144,7 +144,7 @@ def made(
     sky = Sky(north, mjd, None if star is None else (star, 0.1 * star))
     vars(detection).update(
         observation=observation, sky=sky, provenance={"status": status}, rolls=1, subtracted=(),
-        _wcs=(), _digests=(), _calibration_errors=np.zeros((2, count)),
+        _wcs=(), _digest="", _calibration_errors=np.zeros((2, count)),
     )  # fmt: skip
     return detection
 

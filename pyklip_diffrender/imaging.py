@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +34,7 @@ from scipy import sparse
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from pyklip_diffrender.detection.templates import Templates, groups_of
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.convolution import fft_convolve
 from pyklip_diffrender.refinement import Refinement
@@ -74,8 +73,8 @@ def _lanczos(distance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 Image = NDArray[np.float64]
 
-Light = Sequence[Mapping[int, Tensor]]
-"""Images (k, ny, nx) by frame, for every fit."""
+Light = Mapping[int, Tensor]
+"""Images (k, ny, nx) by frame."""
 
 _PRIOR_SOURCE_SNR = 0.8
 """S/N of a source of one standard deviation of the prior. With less, the image is deeper and not as
@@ -116,11 +115,11 @@ _SOLVED_AT_A_TIME = 12
 
 
 class SkyModel:
-    """The sky in the frames of fits of one target."""
+    """The sky in the frames of a fit."""
 
-    def __init__(self, fits: Sequence[Refinement]) -> None:
-        self.groups = groups_of(fits)
-        first = fits[0].frames[0]
+    def __init__(self, fit: Refinement) -> None:
+        self.templates = Templates(fit)
+        first = self.templates.origin
         self.pixelscale = math.sqrt(math.prod(first.observation.pixelscale))
         side = int(_SKY_SIDE_RATIO * max(first.observation.shape)) | 1
         # `shape` is (ny, nx), and `center` the row and column of the star. `grid` (ny, nx, 2) has
@@ -130,27 +129,24 @@ class SkyModel:
         self.shape, self.center = (side, side), side // 2
         y, x = np.indices(self.shape) - self.center
         self.grid = self.pixelscale * np.stack([x, y], axis=-1)
-        self._onto_frames = [
-            {
-                k: interpolation_matrix(self.places(frame.grid, frame.observation.position_angle),
-                                        self.shape)
-                for k, frame in templates.frames.items()
-            }
-            for _, templates in self.groups
-        ]  # fmt: skip
+        self._onto_frames = {
+            k: interpolation_matrix(
+                self.places(frame.grid, frame.observation.position_angle), self.shape
+            )
+            for k, frame in self.templates.frames.items()
+        }
         model = first.model
         self.resolution = float(model.bandpass.mean_wavelength) / model.diameter / ARCSEC
         reach = math.ceil(_SOURCE_REACH_LAMBDA_D * self.resolution / self.pixelscale)
-        self._point_sources = [self._point_source(templates, reach) for _, templates in self.groups]
+        self._source = self._point_source(reach)
         # In white noise n, a source of peak T has a S/N of T |P| / n, so that T =
         # `_PRIOR_SOURCE_SNR` n / |P|.
-        self._prior = _PRIOR_SOURCE_SNR * self._noise() / np.linalg.norm(self._point_sources[0])
+        self._prior = _PRIOR_SOURCE_SNR * self._noise() / np.linalg.norm(self._source)
         self._beam, self._response = self._beam_and_response()
 
-    @staticmethod
-    def _point_source(templates: Templates, reach: int) -> Image:
+    def _point_source(self, reach: int) -> Image:
         """Image of a point source beyond the mask, (k, k) with k odd and a peak of 1."""
-        image = templates.beyond_mask(min(templates.frames)).numpy()
+        image = self.templates.beyond_mask(min(self.templates.frames)).numpy()
         row, column = (n // 2 for n in image.shape)
         reach = min(reach, *((n - 1) // 2 for n in image.shape))
         cut = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
@@ -161,7 +157,7 @@ class SkyModel:
         width = _BEAM_FWHM_LAMBDA_D * self.resolution / self.pixelscale / math.sqrt(8 * math.log(2))
         frequency = np.fft.fftfreq(self.shape[0])
         beam = np.exp(-2 * (math.pi * width) ** 2 * (frequency[:, None] ** 2 + frequency**2))
-        source = self._point_sources[0]
+        source = self._source
         # In white noise B^T Sigma^-1 B is a convolution with the transform s^2 p, where s is the
         # strength of the prior and p the power of P / |P|. The estimate is therefore a filter that
         # keeps s^2 p / (1 + s^2 p) of each frequency. Its value in the middle is the mean over
@@ -184,54 +180,41 @@ class SkyModel:
     def _noise(self) -> Image:
         """Standard deviation of the mean of the frames in every pixel, smoothed."""
         information = np.zeros(self.shape)
-        for (linear, _), matrices in zip(self.groups, self._onto_frames, strict=True):
-            for k, matrix in matrices.items():
-                weight = linear.frames[k].weight.numpy().ravel() ** 2
-                information += np.asarray(matrix.T @ weight).reshape(self.shape)
+        for k, matrix in self._onto_frames.items():
+            weight = self.templates.linear.frames[k].weight.numpy().ravel() ** 2
+            information += np.asarray(matrix.T @ weight).reshape(self.shape)
         information = gaussian_filter(np.maximum(information, 0.0), _NOISE_SMOOTHING_PIXELS)
         return np.asarray(np.maximum(information, 1e-6 * information.max()) ** -0.5)
 
     def light(self) -> Light:
         """Light of the frames beside the star, (1, ny, nx) by frame."""
-        return [
-            {k: linear.frames[k].residual.double()[None] for k in templates.frames}
-            for linear, templates in self.groups
-        ]
+        frames = self.templates.linear.frames
+        return {k: frames[k].residual.double()[None] for k in self.templates.frames}
 
-    def in_frame(self, sky: Image, group: int, frame: int) -> Image:
+    def in_frame(self, sky: Image, frame: int) -> Image:
         """A sky on the pixels of a frame, (ny, nx)."""
-        linear, _ = self.groups[group]
-        image = self._onto_frames[group][frame] @ sky.ravel()
-        return np.asarray(image.reshape(linear.frames[frame].residual.shape))
+        image = self._onto_frames[frame] @ sky.ravel()
+        return np.asarray(image.reshape(self.templates.linear.frames[frame].residual.shape))
 
     def _rendered(self, sky: Image) -> Light:
         """P * (H a)."""
         flat = np.ascontiguousarray(sky.reshape(len(sky), -1).T)
-        images = []
-        for (linear, _), source, matrices in self._parts():
-            ny, nx = linear.frames[0].residual.shape
-            images.append(
-                {
-                    k: torch.from_numpy(fft_convolve((m @ flat).T.reshape(-1, ny, nx), source))
-                    for k, m in matrices.items()
-                }
-            )
-        return images
+        ny, nx = self.templates.linear.frames[0].residual.shape
+        return {
+            k: torch.from_numpy(fft_convolve((matrix @ flat).T.reshape(-1, ny, nx), self._source))
+            for k, matrix in self._onto_frames.items()
+        }
 
     def _collected(self, light: Light) -> Image:
         """The transpose of `_rendered` on Sigma^-1 of images."""
         total: Image | float = 0.0
-        for each, ((linear, _), source, matrices) in zip(light, self._parts(), strict=True):
-            cleaned = linear.clean(each)
-            for k, matrix in matrices.items():
-                whitened = (linear.frames[k].weight * cleaned[k]).numpy()
-                matched = fft_convolve(whitened, source[::-1, ::-1])
-                total = total + np.asarray(matrix.T @ matched.reshape(len(matched), -1).T)
+        linear = self.templates.linear
+        cleaned = linear.clean(light)
+        for k, matrix in self._onto_frames.items():
+            whitened = (linear.frames[k].weight * cleaned[k]).numpy()
+            matched = fft_convolve(whitened, self._source[::-1, ::-1])
+            total = total + np.asarray(matrix.T @ matched.reshape(len(matched), -1).T)
         return np.asarray(total).T.reshape(-1, *self.shape)
-
-    def _parts(self) -> Iterator[tuple[Any, Image, Mapping[int, sparse.csr_matrix]]]:
-        """Each group with its image of a point source and the matrices onto its frames."""
-        return zip(self.groups, self._point_sources, self._onto_frames, strict=True)
 
     def _solved(self, right: Image) -> Image:
         """Solve (1 + B^T Sigma^-1 B) u = b for several b, (k, ny, nx), by conjugate gradients."""
@@ -258,7 +241,7 @@ class SkyModel:
     def estimate(self, light: Light | None = None) -> Image:
         """Posterior mean of the sky, (k, ny, nx), seen with the beam.
 
-        `light` is data minus star, (k, ny, nx) by frame for every fit; by default from the fits.
+        `light` is data minus star, (k, ny, nx) by frame; by default from the fit.
         """
         images = self.light() if light is None else light
         return self._seen(self._prior * self._solved(self._prior * self._collected(images)))
@@ -285,7 +268,7 @@ class SkyModel:
         # With A = (1 + B^T Sigma^-1 B)^-1, the covariance of u is A - A^2. The diagonal of the
         # image's covariance, Q, is the expectation of z * (Q z) for random signs z (C. Bekas,
         # E. Kokiopoulou and Y. Saad 2007, Applied Numerical Mathematics 57, 1214).
-        covered = sum(m.sum(axis=0) for part in self._onto_frames for m in part.values())
+        covered = sum(matrix.sum(axis=0) for matrix in self._onto_frames.values())
         # The prior is wide where no frame is, so that those places would hide all others.
         inside = np.asarray(covered).reshape(self.shape) > 0.5
         signs = inside * np.random.default_rng(seed).choice(
@@ -305,7 +288,7 @@ class SkyModel:
         """
         # Sources in combs, with random signs, are measured together. What they change in the star
         # at each other's places averages out over the median of a ring of lambda/D.
-        first = self.groups[0][1].origin
+        first = self.templates.origin
         ny, nx = first.observation.shape
         rows, columns = (np.arange(0, n, _THROUGHPUT_STEP_PIXELS) for n in (ny, nx))
         y, x = (each.ravel() for each in np.meshgrid(rows, columns, indexing="ij"))
@@ -333,19 +316,15 @@ class SkyModel:
         signs: Image,
     ) -> Light:
         """Sums of sources with peaks of 1 or -1 in the first frame."""
-        light: list[dict[int, Tensor]] = []
-        peaks: dict[int, Tensor] = {}
-        for _, templates in self.groups:
-            sums: dict[int, list[Tensor]] = {k: [] for k in templates.frames}
-            for each, chosen in enumerate(members):
-                images = templates.at_pixels(rows[chosen], columns[chosen])
-                # Sources behind the mask would otherwise be lost among the others.
-                peak = peaks.setdefault(each, images[min(images)].double().amax(dim=(1, 2)))
-                weight = torch.from_numpy(signs[chosen]) / peak
-                for k, image in images.items():
-                    sums[k].append(torch.tensordot(weight, image.double(), dims=1))
-            light.append({k: torch.stack(images) for k, images in sums.items()})
-        return light
+        sums: dict[int, list[Tensor]] = {k: [] for k in self.templates.frames}
+        for chosen in members:
+            images = self.templates.at_pixels(rows[chosen], columns[chosen])
+            # Sources behind the mask would otherwise be lost among the others.
+            peak = images[min(images)].double().amax(dim=(1, 2))
+            weight = torch.from_numpy(signs[chosen]) / peak
+            for k, image in images.items():
+                sums[k].append(torch.tensordot(weight, image.double(), dims=1))
+        return {k: torch.stack(images) for k, images in sums.items()}
 
 
 def _by_ring(values: Image, at: Image, distance: Image) -> Image:

@@ -20,7 +20,6 @@ from pyklip_diffrender.detection import Motion, checked_motion
 from pyklip_diffrender.detection.combined_result import scales_of, star_of_filter, unmoved
 from pyklip_diffrender.detection.error_factor import ErrorFactor, structures_in_single_roll
 from pyklip_diffrender.detection.sky_map import Family, SkyStack
-from pyklip_diffrender.detection.templates import weigh
 from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.linear.model import LinearModel, Unknown
@@ -69,7 +68,7 @@ def test_it_is_the_joint_likelihood_of_all_frames(pair):
     offsets = torch.from_numpy(grid.reshape(-1, 2))
     exact = []
     for each in pair:
-        products = weigh(each.groups, lambda templates: templates.at(offsets))
+        products = each.templates.linear.weigh(each.templates.at(offsets))
         information = products.information.numpy().reshape(grid.shape[:2])
         contrast = products.numerator.numpy().reshape(grid.shape[:2]) / information
         snr = contrast * np.sqrt(information)
@@ -88,9 +87,9 @@ def test_it_is_the_joint_likelihood_of_all_frames(pair):
     stack = SkyStack.of(both.maps, filters, scales, places, unmoved(both.maps))
     snr = np.einsum("kfn,fn->kn", stack.weights(both.spectra.flux), stack.snr)
     amplitude_error = stack.amplitude_errors(both.spectra.flux)
-    joint = stacked([each.groups[0][0] for each in pair])
+    joint = stacked([each.templates.linear for each in pair])
     at = torch.from_numpy(np.array([grid[pixel] for pixel in pixels]))
-    images = [each.groups[0][1].at(at)[0] for each in pair]
+    images = [each.templates.at(at)[0] for each in pair]
     stars = [
         dr.instrument.star_flux_density("A2V, K=6.77", name).value for name in ("F444W", "F356W")
     ]

@@ -56,7 +56,7 @@ def pair():
 
 def fluxes(detection):
     """Flux of every candidate by separation, and its S/N."""
-    flux, table = detection.fits[0].frames[0].star_light, detection.candidates
+    flux, table = detection.fit.frames[0].star_light, detection.candidates
     order = np.argsort(table["separation"])
     return flux * np.asarray(table["contrast"])[order], np.asarray(table["snr"])[order]
 
@@ -71,7 +71,7 @@ def test_limits_are_the_deeper_ones():
     magnitudes = joined.contrast_curve["delta_mag"].value
     np.testing.assert_allclose(10 ** (-0.4 * magnitudes), joined.contrast_curve["contrast"])
     # In units of flux, the map has the errors of the one or the other.
-    star = [each.fits[0].frames[0].star_light for each in (first, second)]
+    star = [each.fit.frames[0].star_light for each in (first, second)]
     away = separation_of(joined.grid)
     for part, search, unit in ((away < 0.5, first, star[0]), (away > 0.7, second, star[1])):
         expected = unit * search.error[part]
@@ -96,7 +96,7 @@ def test_measurements_are_those_of_the_deeper_search():
     first, second = pair()
     joined = deeper(first, second)
     places = [[0.3, 0.3], [-0.7, 0.4]]
-    star = [each.fits[0].frames[0].star_light for each in (first, second)]
+    star = [each.fit.frames[0].star_light for each in (first, second)]
     measured = joined.measure(places)
     for k, (search, unit) in enumerate(((first, star[0]), (second, star[1]))):
         row = search.measure(places)[k]
@@ -115,7 +115,7 @@ def test_the_joined_search_is_read_as_it_was_written(tmp_path):
     joined = deeper(*pair())
     joined.write(tmp_path)
     for name, search in (("fit.fits", joined), ("fit_other.fits", joined.other)):
-        search.fits[0].write(tmp_path / name, linear=True)
+        search.fit.write(tmp_path / name, linear=True)
     again = dr.Detection.read(tmp_path)
     np.testing.assert_array_equal(again.of_other, joined.of_other)
     for name in ("separation", "contrast", "snr", "position_angle"):
@@ -132,11 +132,11 @@ def test_the_joined_search_is_read_as_it_was_written(tmp_path):
 
 def test_the_fit_that_is_deeper_at_most_separations_is_kept_and_the_others_are_named():
     alone, together = pair()
-    fits = alone.fits[0], together.fits[0]
+    fits = alone.fit, together.fit
     kept, detection, gain, where = visit._kept(*fits, alone, together)
     separations, limits = stated_limits(alone)
     gains = limits / stated_limits(together)[1]
-    assert kept is fits[int(np.median(gains) > 1)] is detection.fits[0]
+    assert kept is fits[int(np.median(gains) > 1)] is detection.fit
     assert gain == pytest.approx(np.median(gains[separations > EDGE]))
     assert where == f"at 0.7 to {separations[-1]:.1f} arcsec"
     # A fit of all frames whose errors are not calibrated is no gain over one whose are.
@@ -152,7 +152,7 @@ def with_darker_stop(detection, loss):
     An imaginary OPD a multiplies the amplitude by exp(-2 pi a / lambda). Sources of the same light
     then have larger contrasts.
     """
-    (fit,) = detection.fits
+    fit = detection.fit
     (frame,) = fit.frames
     wavelength = fit.model.bandpass.mean_wavelength
     imaginary = -np.log(1 - loss) * wavelength / (4 * np.pi)
@@ -164,7 +164,7 @@ def with_darker_stop(detection, loss):
     units = np.repeat([more, 1.0, 1.0], len(own))
     return replace(
         detection,
-        fits=(replace(fit, frames=(darker,)),),
+        stored_fit=replace(fit, frames=(darker,)),
         contrast=more * detection.contrast,
         error=more * detection.error,
         photon_error=more * detection.photon_error,

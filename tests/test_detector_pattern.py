@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 import pyklip_diffrender as dr
 from benchmarks.noisy_stars import READ_NOISE, drifted_star
 from pyklip_diffrender.detection.candidates import Maps
-from pyklip_diffrender.detection.templates import groups_of
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.pattern import measure
 from pyklip_diffrender.refinement import Status, refine_again
@@ -198,10 +198,9 @@ def test_a_single_roll_may_show_more_of_a_structure_than_the_pattern_says():
     flat[21:24, 22:25] += 0.08
     drawn = DetectorPattern(flat, 0.1 * abs(flat), MIDDLE, 0.01, first_pixel=(600, 1600))
     fits = [star().refined(frames, pattern=drawn) for frames in (rolls()[0], rolls())]
-    single, both = (Maps(groups_of([fit])) for fit in fits)
-    ((linear, templates),) = single.groups
-    planet = templates.at_pixels(np.array([22]), np.array([23]))[0][0].numpy()
-    weighted = planet * linear.frames[0].weight.numpy() ** 2
+    single, both = (Maps(Templates(fit)) for fit in fits)
+    planet = single.templates.at_pixels(np.array([22]), np.array([23]))[0][0].numpy()
+    weighted = planet * single.templates.linear.frames[0].weight.numpy() ** 2
     contrast = (weighted * flat * light())[20:25, 21:26].sum() / (weighted * planet).sum()
     snr = contrast * np.sqrt(single.information[22, 23])
     assert single.structures[22, 23] == pytest.approx(snr, rel=0.25)

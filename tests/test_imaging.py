@@ -31,9 +31,8 @@ def sky():
         planet = dr.Planet.from_offset(CONTRAST, *PLACE).rotated(-angle)
         shot = dr.simulate(model, dr.Scene(planets=(planet,)), opd, seed=k)
         frames.append(replace(shot, position_angles=np.full(len(shot), angle)))
-    return SkyModel(
-        [dr.refine(model, frames, opd, settings=dr.FitSettings(cycles=3, max_companions=0))]
-    )
+    settings = dr.FitSettings(cycles=3, max_companions=0)
+    return SkyModel(dr.refine(model, frames, opd, settings=settings))
 
 
 def convolution(kernel, ny, nx):
@@ -47,11 +46,11 @@ def convolution(kernel, ny, nx):
 def dense():
     """Images of point sources in the data, and the posterior mean of their peaks, as matrices."""
     model = sky()
-    linear, _ = model.groups[0]
+    linear = model.templates.linear
     ny, nx = linear.frames[0].residual.shape
     n = ny * nx
-    seen = convolution(model._point_sources[0], ny, nx)
-    h = np.concatenate([seen @ model._onto_frames[0][k].toarray() for k in (0, 1)])
+    seen = convolution(model._source, ny, nx)
+    h = np.concatenate([seen @ model._onto_frames[k].toarray() for k in (0, 1)])
     inverse = np.zeros((2 * n, 2 * n))
     for k in (0, 1):
         cleaned = linear.clean({k: torch.eye(n, dtype=torch.float64).reshape(n, ny, nx)})
@@ -64,7 +63,7 @@ def dense():
 
 def test_the_estimate_is_that_of_the_closed_form():
     model = sky()
-    data = np.concatenate([model.light()[0][k][0].numpy().ravel() for k in (0, 1)])
+    data = np.concatenate([model.light()[k][0].numpy().ravel() for k in (0, 1)])
     sources = (dense()[1] @ data).reshape(model.shape)
     expected = np.fft.ifft2(np.fft.fft2(sources) * model._beam).real
     # Conjugate gradients end at a residual of a thousandth, in other units.
@@ -91,7 +90,7 @@ def test_the_error_is_that_of_the_closed_form():
 def test_a_source_in_white_noise_keeps_its_peak():
     """Noise of 1 everywhere, a prior of the stated S/N, frames that repeat beyond their edges."""
     model = sky()
-    kernel = model._point_sources[0]
+    kernel = model._source
     source = np.zeros(model.shape)
     source[model.center, model.center] = 1.0
     places = np.indices(model.shape).reshape(2, -1).T - model.center
@@ -111,13 +110,12 @@ def test_a_source_in_white_noise_keeps_its_peak():
 
 def test_a_source_has_the_stated_throughput():
     model = sky()
-    _, templates = model.groups[0]
     row, column = 16, 19
-    first = templates.origin
+    first = model.templates.origin
     place = torch.from_numpy(first.grid[row, column])[None]
-    light = {k: 1e-3 * each for k, each in templates.at(place).items()}
-    data = model.light()[0]
-    added = model.estimate([{k: data[k] + light[k] for k in light}])[0] - model.estimate()[0]
+    light = {k: 1e-3 * each for k, each in model.templates.at(place).items()}
+    data = model.light()
+    added = model.estimate({k: data[k] + light[k] for k in light})[0] - model.estimate()[0]
     # The first frame has north up.
     brightest = np.unravel_index(added.argmax(), added.shape)
     np.testing.assert_allclose(model.grid[brightest], place[0], atol=model.pixelscale)

@@ -53,7 +53,7 @@ def curve_of(science, references=(), separations=None, hidden=False, sources=Non
     """KLIP's curve for fitted frames, as if a search but where `hidden` had these `sources`."""
     curve = SimpleNamespace(meta={"resolution_arcsec": RESOLUTION})
     searched = SimpleNamespace(
-        fits=(SimpleNamespace(frames=tuple(science)),), contrast_curve=curve,
+        templates=Templates(SimpleNamespace(frames=tuple(science))), contrast_curve=curve,
         grid=science[0].grid, sources=Candidates.at([], []) if sources is None else sources,
         has_limits=~np.broadcast_to(hidden, science[0].grid.shape[:2]),
     )  # fmt: skip
@@ -78,7 +78,7 @@ def quiet():
 
 def photon_limits(science):
     """5-sigma limits for a known star, at one position angle."""
-    templates = Templates(SimpleNamespace(frames=science), science[0])
+    templates = Templates(SimpleNamespace(frames=science))
     places = torch.tensor(np.stack([SEPARATIONS, 0 * SEPARATIONS], axis=-1))
     information = sum(
         (image.numpy() ** 2 / science[k].observation.error ** 2).sum(axis=(1, 2))
@@ -107,7 +107,7 @@ def test_candidates_are_not_noise():
     """Neither a companion of the fit nor a planet that only the search found, in one ring."""
     science, references = frames()
     sources = Candidates.at([[0.5, 0.0], [-0.3, 0.4]], [1e-2, 4e-3])
-    templates = Templates(SimpleNamespace(frames=science), science[0])
+    templates = Templates(SimpleNamespace(frames=science))
     light = templates.at(sources.offsets)
     crowded = []
     for k, each in enumerate(science):

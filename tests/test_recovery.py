@@ -61,7 +61,7 @@ def searched(science=None, **changes):
     )
     values = {
         "has_limits": np.isfinite(changes.get("snr", snr)),
-        "fits": [SimpleNamespace(frames=[Frame(1.0), Frame(2.0)])], "sources": sources,
+        "fit": SimpleNamespace(frames=[Frame(1.0), Frame(2.0)]), "sources": sources,
         "grid": grid, "snr": snr, "north": NORTH, "contrast_curve": curve, "measure": measure,
         "error_factor": ErrorFactor.constant(1.0),
     }  # fmt: skip
@@ -83,7 +83,7 @@ def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(flux):
 
     def search(science):
         sets.append(science)
-        return searched(science, fits=[SimpleNamespace(frames=[Frame(flux), Frame(2 * flux)])])
+        return searched(science, fit=SimpleNamespace(frames=[Frame(flux), Frame(2 * flux)]))
 
     planets = recover_planets(searched(), 5, search)
     assert len(planets) == 5
@@ -198,7 +198,7 @@ def test_the_contrast_of_a_fraction_is_interpolated():
     assert np.isnan(dr.detection.contrast_of_completeness(table, 0.95)["contrast"]).all()
 
 
-def test_without_fits_there_is_no_completeness(tmp_path):
+def test_without_a_fit_there_is_no_completeness(tmp_path):
     path = next(each for each in star_alone().write(tmp_path) if each.suffix == ".fits")
-    with pytest.raises(IncompatibleSetupError, match="without its fits"):
+    with pytest.raises(IncompatibleSetupError, match="without its fit"):
         dr.detection.completeness(dr.Detection.read(path))

@@ -490,7 +490,7 @@ def test_images_have_north_up():
     whole = reduction()
     star = replace(whole.sequence.science[0], reference=True)
     # A reference without the planet, which is in the lower left.
-    fitted = whole.detection.fits[0].frames[0]
+    fitted = whole.detection.fit.frames[0]
     alone = replace(star, data=fitted.star[None] + 0.1 * star.error)
     klip = Klip.of(replace(whole, sequence=replace(whole.sequence, references=(alone,))))
     assert klip.label == "KLIP RDI (1 reference frame, 1 mode)"
@@ -655,7 +655,7 @@ def shown():
     known = dr.DetectorPattern(
         flat, flat, (1.0, 1.0), 0.02, name=HOSTILE, filter=HOSTILE, provenance={"stars": [HOSTILE]}
     )
-    detection = replace(whole.detection, fits=(fit,))
+    detection = replace(whole.detection, stored_fit=fit)
     again = replace(whole, sequence=sequence, fit=fit, detection=detection, pattern=known)
     wide = dr.detection.WideField(
         detection, 5.0, flat, flat, flat, flat, detection.error_factor, detection.candidates,

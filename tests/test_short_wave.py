@@ -71,7 +71,7 @@ def test_a_planet_is_where_it_is_and_nothing_else(tmp_path):
     frame, opd = calints(tmp_path), random_opd(1, npix=256)
     result = reduce([frame], opd, size=SIZE, settings=settings)
     assert result.pattern is None
-    assert result.fit is result.detection.fits[0]
+    assert result.fit is result.detection.fit
     assert len(result.fit.companions) == 1
     table = result.detection.candidates
     assert len(table) == 1

@@ -322,7 +322,7 @@ def sky_of(*frames, catalogue_error=None, scatter=1.0):
     fit = SimpleNamespace(
         frames=frames, catalogue_error=catalogue_error, catalogue_flux=None, initial=opd
     )
-    return Sky.of([fit], scatter=scatter)
+    return Sky.of(fit, scatter=scatter)
 
 
 def test_the_stop_passes_what_arrives_of_a_star_without_the_occulter():

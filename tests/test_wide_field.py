@@ -26,7 +26,7 @@ from pyklip_diffrender.detection import (
     wide_field,
     without_blurred_edges,
 )
-from pyklip_diffrender.detection.templates import Templates, groups_of
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics.grid import resample
@@ -234,7 +234,7 @@ def test_sources_far_from_the_star_are_not_behind_a_bar():
     frame = dr.simulate(behind, dr.Scene(STAR), opd, seed=5)
     settings = dr.FitSettings(wavefront=False, companions_if_stalled=False)
     fit = dr.refine(behind, frame, opd, settings=settings)
-    clear = fit.frames[0].flux * float(Templates(fit, fit.frames[0]).beyond_mask(0).max())
+    clear = fit.frames[0].flux * float(Templates(fit).beyond_mask(0).max())
     assert WholeFrame(fit.frames[0], frame, 0.0).kernel.max() == pytest.approx(clear, rel=0.1)
 
 
@@ -362,9 +362,9 @@ def test_nothing_is_found_outside_the_searched_pixels(crowded):
 def test_the_map_has_north_up_and_numbered_circles(crowded):
     detection, frame, wide = crowded
     turned = replace(frame, position_angles=np.array([90.0]))
-    (fit,) = detection.fits
-    part = replace(fit.frames[0], observation=turned.cutout(24))
-    oriented = replace(wide, detection=replace(detection, fits=(replace(fit, frames=(part,)),)))
+    part = replace(detection.fit.frames[0], observation=turned.cutout(24))
+    fit = replace(detection.fit, frames=(part,))
+    oriented = replace(wide, detection=replace(detection, stored_fit=fit))
     # With +y at a position angle of 90 degrees, +y is east and +x is north.
     for each, turn in ((wide, lambda x, y: (x, y)), (oriented, lambda x, y: (y, x))):
         ax, _ = each.plot()
@@ -403,8 +403,8 @@ def test_planets_are_measured_wherever_they_are(searched):
 @pytest.mark.slow
 def test_contrasts_outside_have_the_error_of_the_stars_flux_as_well(searched):
     detection, frames, wide = searched
-    uncertain = replace(detection.fits[0], catalogue_error=0.1)
-    again = wide_field(replace(detection, fits=(uncertain,)), frames).candidates
+    uncertain = replace(detection.fit, catalogue_error=0.1)
+    again = wide_field(replace(detection, stored_fit=uncertain), frames).candidates
     outside = np.isfinite(again["fit_chi2"])
     assert outside.any()
     added = again["contrast_error"] ** 2 - wide.candidates["contrast_error"] ** 2
@@ -453,7 +453,7 @@ def test_a_hot_pixel_is_no_source_and_a_source_no_hot_pixel(searched):
     data = frame.data.copy()
     data[0, 20, 80] += 100 * frame.error[0, 20, 80]
     for each, bad in ((frame, []), (replace(frame, data=data), [[20, 80]])):
-        sigma = WholeFrame(detection.fits[0].frames[0], each, 0.0).sigma
+        sigma = WholeFrame(detection.fit.frames[0], each, 0.0).sigma
         assert np.argwhere(~np.isfinite(sigma)).tolist() == bad
 
 
@@ -521,7 +521,7 @@ def test_a_ring_keeps_its_light():
     assert amount(np.nan_to_num(disk.image), rings[0]) == pytest.approx(1.0, abs=0.1)
     assert disk.contrast == pytest.approx(BRIGHTNESS, rel=0.15)
     # The second roll is turned by 12 degrees, 3 pixels at this separation.
-    ((_, templates),) = groups_of([disk.fit])
+    templates = Templates(disk.fit)
     place = torch.tensor([[0.9, 0.3]], dtype=torch.float64)
     light = templates.at(place)[1][0].numpy()
     peak = np.unravel_index(light.argmax(), light.shape)
@@ -595,8 +595,7 @@ def test_non_negative_light_is_that_of_scipy():
 
 def planets_in(frames, places, contrast):
     """The frames with planets at x, y from the star in the first of them, arcsec."""
-    ((_, templates),) = groups_of([fitted()[1].fit])
-    light = templates.at(torch.tensor(places, dtype=torch.float64))
+    light = Templates(fitted()[1].fit).at(torch.tensor(places, dtype=torch.float64))
     return [
         replace(each, data=each.data + contrast * light[k].sum(dim=0).numpy())
         for k, each in enumerate(frames)

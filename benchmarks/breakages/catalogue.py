@@ -390,7 +390,8 @@ def _detection() -> list[Breakage]:
         ),
         Breakage(
             "inflation", "errors grow with the square root of chi-squared",
-            "return math.sqrt(max(1.0, reduced * share))", "return max(1.0, reduced * share)",
+            "return math.sqrt(max(1.0, fit.reduced_chi2 * share))",
+            "return max(1.0, fit.reduced_chi2 * share)",
             "detection error_factor",
         ),
         Breakage(

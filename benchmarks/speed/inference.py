@@ -13,7 +13,7 @@ from benchmarks.speed.setting import Setting
 from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.measurement import contrasts_at
-from pyklip_diffrender.detection.templates import groups_of
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.refinement import FitSettings, Refinement, refine
 from pyklip_diffrender.wavefront.bases import default_basis
 
@@ -95,7 +95,7 @@ def snr_map(setting: Setting) -> list[Case]:
         Case(
             MAP,
             "one call of the fine model a position",
-            lambda: partial(contrasts_at, groups_of([fit()]), places, unscaled),
+            lambda: partial(contrasts_at, Templates(fit()), places, unscaled),
             lambda _: Accuracy(0.0),
             reference=True,
             times=pixels / 2,

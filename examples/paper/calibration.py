@@ -33,7 +33,7 @@ RINGS = np.arange(0.3, 2.35, 0.2)
 
 def known_star_snr(detection: Detection, shot: Frame) -> NDArray[np.float64]:
     """S/N map of the matched filter that knows the star and its noise."""
-    templates = detection.groups[0][1]
+    templates = detection.templates
     ny, nx = shot.star.shape
     whitened = torch.from_numpy(shot.known_star / shot.noise)
     weight = torch.from_numpy(1 / shot.noise)

@@ -120,7 +120,7 @@ def one_seed(setup: Setting, places: tuple[float, ...], steps: int, seed: int) -
 def together(fit: Refinement, planets: list[Planet]) -> Image:
     """Contrasts of planets measured together, for their wings overlap."""
     places = torch.tensor([p.offset for p in planets]).double()
-    templates = Templates(fit, fit.frames[0]).at(places)
+    templates = Templates(fit).at(places)
     matrix, vector = fit.star_only.normal_equations(templates)
     return torch.linalg.solve(matrix, vector).numpy()
 

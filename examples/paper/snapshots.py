@@ -36,15 +36,19 @@ def one_seed(setup: Setting, counts: tuple[int, ...], linked: int, seed: int) ->
         frame(setup, BEGIN + APART * k, 100 * seed + k, [PLANET]).observation
         for k in range(max(counts))
     ]
-    fits = [dr.refine(setup.model, shot, setup.measured) for shot in shots]
+    alone = [
+        dr.detect(dr.refine(setup.model, shot, setup.measured)).measure([PLANET.offset])[0]
+        for shot in shots
+    ]
+    measured, errors = np.array([(row["contrast"], row["contrast_error"]) for row in alone]).T
     rows = []
     for count in counts:
-        separate = dr.detect(fits[:count]).measure([PLANET.offset])
+        weights = errors[:count] ** -2.0
         row = {
             "snapshots": count,
             "seed": seed,
-            "measured": float(separate["contrast"][0]),
-            "error": float(separate["contrast_error"][0]),
+            "measured": float(np.average(measured[:count], weights=weights)),
+            "error": float(weights.sum() ** -0.5),
             "linked": math.nan,
             "linked_error": math.nan,
         }

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from pyklip_diffrender.detection.error_factor import ErrorFactor, compact_structures
 from pyklip_diffrender.detection.field import Image, pixel_width
-from pyklip_diffrender.detection.templates import Group, Templates, has_only_reference_stars
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.linear import LinearModel, coarse_copy, downsample
+from pyklip_diffrender.linear import coarse_copy, downsample
 from pyklip_diffrender.linear.model import LinearFrame
 from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
@@ -85,13 +85,10 @@ class Candidates:
         keep = np.arange(len(self)) != index
         return Candidates.at(self.offsets[keep], self.contrasts[keep])
 
-    def planets(self, roll: float = 0.0) -> tuple[Planet, ...]:
-        """As planets in a frame whose sky is turned by `roll` degrees counter-clockwise.
-
-        Negative contrasts become 0.
-        """
+    def planets(self) -> tuple[Planet, ...]:
+        """Planets in the first frame; negative contrasts become 0."""
         rows = torch.column_stack([self.contrasts.clamp(min=0), self.offsets]).tolist()
-        return tuple(Planet.from_offset(*row).rotated(roll) for row in rows)
+        return tuple(Planet.from_offset(*row) for row in rows)
 
     def light(self, templates: Templates) -> dict[int, Tensor]:
         """Image of all candidates together, (1, ny, nx) by frame, in the data's unit."""
@@ -109,7 +106,7 @@ class Candidates:
 
 
 def refine_candidates(
-    groups: Sequence[Group], candidates: Candidates, reach: float, iterations: int = _MOST_STEPS
+    templates: Templates, candidates: Candidates, reach: float, iterations: int = _MOST_STEPS
 ) -> Candidates:
     """Fit contrasts and positions of all candidates together, with the star marginalised.
 
@@ -124,23 +121,18 @@ def refine_candidates(
     #
     #     (B Sigma^-1 B^T)^-1 B Sigma^-1 (r - sum_j c_j p_j)
     #
-    # with both products summed over the groups. The inverse of the part by contrasts alone has the
-    # errors for known positions.
+    # The inverse of the part by contrasts alone has the errors for known positions.
     identity = torch.eye(3 * count, dtype=torch.float64)
     covariance, converged = identity, False
     detection_errors = torch.ones(count, dtype=torch.float64)
     for _ in range(iterations):
         # The model is linear in contrasts. The column of a position is slope times contrast.
-        matrix = torch.zeros(3 * count, 3 * count, dtype=torch.float64)
-        vector = torch.zeros(3 * count, dtype=torch.float64)
-        for linear, templates in groups:
-            columns = {
-                frame: torch.cat([part[0], *(contrasts[:, None, None] * part[1:])])
-                for frame, part in templates.at(offsets, slopes=True).items()
-            }
-            curvature, gradient = linear.normal_equations(columns)
-            matrix += curvature
-            vector += gradient - curvature[:, :count] @ contrasts
+        columns = {
+            frame: torch.cat([part[0], *(contrasts[:, None, None] * part[1:])])
+            for frame, part in templates.at(offsets, slopes=True).items()
+        }
+        matrix, gradient = templates.linear.normal_equations(columns)
+        vector = gradient - matrix[:, :count] @ contrasts
         # The ridge keeps positions where they are if the contrast is near 0.
         scale = matrix.diagonal().clamp(min=1e-300).sqrt()
         ridge = 1e-9 * identity
@@ -179,27 +171,25 @@ _LAG_PLACES = 4
 
 
 class Maps:
-    """Inner products with a planet at every pixel of the first frame, of groups of fits."""
+    """Inner products with a planet at every pixel of the first frame of a fit."""
 
-    def __init__(self, groups: Sequence[Group], progress: bool = False) -> None:
-        self.groups, self.progress = tuple(groups), progress
-        self.grid = self.groups[0][1].grid
+    def __init__(self, templates: Templates, progress: bool = False) -> None:
+        self.templates, self.progress = templates, progress
+        self.grid = templates.grid
         ny, nx = self.shape = self.grid.shape[:2]
-        frames = sum(len(templates.frames) for _, templates in self.groups)
-        self._stores = 4.0 * frames * (ny * nx) ** 2 <= min(_STORE_BYTES, self._spare())
-        self._stored: dict[tuple[int, int], dict[int, Tensor]] = {}
+        size = 4.0 * len(templates.frames) * (ny * nx) ** 2
+        self._stores = size <= min(_STORE_BYTES, self._spare())
+        self._stored: dict[int, dict[int, Tensor]] = {}
         total, light = np.zeros((3, ny * nx)), np.zeros((2, ny * nx))
         steps = np.linspace(0, 1, _LAG_PLACES + 2)[1:-1]
         rows, columns = np.meshgrid((ny * steps).astype(int), (nx * steps).astype(int))
         self._places = rows.ravel(), columns.ravel()
-        cleaned = self._cleaned(
-            [templates.at_pixels(*self._places) for _, templates in self.groups]
-        )
+        cleaned = self._cleaned(templates.at_pixels(*self._places))
         between = np.zeros((len(rows.ravel()), ny * nx))
-        for g, pixels, images in self._batches("S/N map"):
-            total[:, pixels] += torch.stack(self.groups[g][0].weigh(images)).numpy()
-            light[:, pixels] += self._starlight(g, images)
-            between[:, pixels] += _products(cleaned[g], images)
+        for pixels, images in self._batches("S/N map"):
+            total[:, pixels] = torch.stack(templates.linear.weigh(images)).numpy()
+            light[:, pixels] = self._starlight(images)
+            between[:, pixels] = _products(cleaned, images)
         self._between = between.reshape(-1, ny, nx)
         # p . Sigma^-1 r, p . Sigma^-1 p and p . C^-1 p, (ny, nx) each, see `TemplateProducts`; and
         # star over noise, averaged over pixels with the squared S/N that a planet has in each.
@@ -207,12 +197,12 @@ class Maps:
         with np.errstate(invalid="ignore"):
             self.starlight = (light[0] / light[1]).reshape(ny, nx)
 
-    def _starlight(self, g: int, images: Mapping[int, Tensor]) -> Image:
+    def _starlight(self, images: Mapping[int, Tensor]) -> Image:
         """Squared S/N of planets, with and without the star over noise of each pixel, (2, k)."""
-        linear, templates = self.groups[g]
+        linear = self.templates.linear
         total = np.zeros((2, len(next(iter(images.values())))))
         for k, planets in images.items():
-            fitted, weight = templates.frames[k], linear.frames[k].weight
+            fitted, weight = self.templates.frames[k], linear.frames[k].weight
             star = torch.from_numpy(fitted.star - fitted.values["background"][0])
             squares = weight.square()
             columns = torch.stack([squares * weight * star, squares]).flatten(1).to(planets.dtype)
@@ -252,47 +242,42 @@ class Maps:
         # and the pattern of the two fainter stars predicts half of that for the third. So a
         # structure may be as large again.
         nothing = np.zeros(self.shape)
-        if count_rolls([templates.fit for _, templates in self.groups]) > 1:
+        if count_rolls(self.templates.fit) > 1:
             return nothing
-        light = [
-            {k: torch.from_numpy(_compact_light(frame))[None] for k, frame in each.frames.items()}
-            for _, each in self.groups
-        ]
-        if not any(bool(image.any()) for images in light for image in images.values()):
+        light = {
+            k: torch.from_numpy(_compact_light(frame))[None]
+            for k, frame in self.templates.frames.items()
+        }
+        if not any(bool(image.any()) for image in light.values()):
             return nothing
-        noises = [linear.noise for linear, _ in self.groups]
-        weighted = [noise.weighted(part) for noise, part in zip(noises, light, strict=True)]
-        contrast = self._summed(weighted)[0] / np.where(self.photon > 0, self.photon, np.inf)
+        weighted = self.templates.linear.noise.weighted(light)
+        contrast = self._at_all_pixels(weighted)[0] / np.where(self.photon > 0, self.photon, np.inf)
         return np.asarray(np.abs(contrast) * np.sqrt(np.maximum(self.information, 0.0)))
 
     def _spare(self) -> float:
-        """Bytes that the settings of the fits leave beside the linear models."""
-        models = sum(
-            4.0 * frame.jacobian.numel() for linear, _ in self.groups for frame in linear.frames
-        )
-        return min(each.fit.settings.memory_beside(models) for _, each in self.groups)
+        """Bytes that the settings of the fit leave beside its linear model."""
+        model = sum(4.0 * frame.jacobian.numel() for frame in self.templates.linear.frames)
+        return self.templates.fit.settings.memory_beside(model)
 
-    def _batches(self, name: str) -> Iterator[tuple[int, slice, dict[int, Tensor]]]:
-        """Index of the group, flat indices of pixels, and their templates by frame."""
+    def _batches(self, name: str) -> Iterator[tuple[slice, dict[int, Tensor]]]:
+        """Flat indices of pixels, and their templates by frame."""
         ny, nx = self.shape
-        pixels = ny * nx * len(self.groups)
-        with ProgressBar(name, pixels, shown=self.progress) as progress_bar:
-            for g, (_, templates) in enumerate(self.groups):
-                for start in range(0, ny * nx, _TEMPLATES_AT_A_TIME):
-                    index = np.arange(start, min(start + _TEMPLATES_AT_A_TIME, ny * nx))
-                    images = self._stored.get((g, start))
-                    if images is None:
-                        images = templates.at_pixels(*np.divmod(index, nx))
-                        if self._stores:
-                            self._stored[g, start] = images
-                    yield g, slice(start, start + len(index)), images
-                    progress_bar.update(len(index))
+        with ProgressBar(name, ny * nx, shown=self.progress) as progress_bar:
+            for start in range(0, ny * nx, _TEMPLATES_AT_A_TIME):
+                index = np.arange(start, min(start + _TEMPLATES_AT_A_TIME, ny * nx))
+                images = self._stored.get(start)
+                if images is None:
+                    images = self.templates.at_pixels(*np.divmod(index, nx))
+                    if self._stores:
+                        self._stored[start] = images
+                yield slice(start, start + len(index)), images
+                progress_bar.update(len(index))
 
     def without(self, candidates: Candidates) -> Image:
         """The numerator after candidates are removed from the data, (ny, nx)."""
         if not len(candidates):
             return self.numerator
-        light = [candidates.light(templates) for _, templates in self.groups]
+        light = candidates.light(self.templates)
         return np.asarray(self.numerator - self.change(light)[0])
 
     def response(self, offsets: Tensor) -> Image:
@@ -300,26 +285,24 @@ class Maps:
 
         `offsets` (k, 2), float64, are x, y from the star, arcsec.
         """
-        return self.change([templates.at(offsets) for _, templates in self.groups])
+        return self.change(self.templates.at(offsets))
 
-    def change(self, light: Sequence[Mapping[int, Tensor]]) -> Image:
-        """Change of the numerator, (k, ny, nx), by images, (k, ny, nx) by frame for each group."""
-        return self._summed(self._cleaned(light))
+    def change(self, light: Mapping[int, Tensor]) -> Image:
+        """Change of the numerator, (k, ny, nx), by images, (k, ny, nx) by frame."""
+        return self._at_all_pixels(self._cleaned(light))
 
-    def _summed(self, weighted: Sequence[Mapping[int, Tensor]]) -> Image:
-        """Inner products with planets at all pixels, (k, ny, nx)."""
+    def _at_all_pixels(self, weighted: Mapping[int, Tensor]) -> Image:
+        """Inner products of images, by frame, with planets at all pixels, (k, ny, nx)."""
         ny, nx = self.shape
-        total = np.zeros((len(weighted[0][0]), ny * nx))
-        for g, pixels, images in self._batches("candidates"):
-            total[:, pixels] += _products(weighted[g], images)
+        total = np.zeros((len(weighted[0]), ny * nx))
+        for pixels, images in self._batches("candidates"):
+            total[:, pixels] = _products(weighted, images)
         return total.reshape(-1, ny, nx)
 
-    def _cleaned(self, light: Sequence[Mapping[int, Tensor]]) -> list[dict[int, Tensor]]:
-        """C^-1 of the parts of images that the unknowns cannot reproduce, by group and frame."""
-        return [
-            {k: linear.frames[k].weight * image for k, image in linear.clean(part).items()}
-            for (linear, _), part in zip(self.groups, light, strict=True)
-        ]
+    def _cleaned(self, light: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """C^-1 of the parts of images that the unknowns cannot reproduce, by frame."""
+        linear = self.templates.linear
+        return {k: linear.frames[k].weight * image for k, image in linear.clean(light).items()}
 
     def snr(self, numerator: Image | None = None) -> Image:
         """Amplitude over its standard deviation; NaN where there is no information."""
@@ -354,58 +337,40 @@ _CONTRAST_SIGMAS = 5.0
 standard deviations, with which the fit has found the source."""
 
 
-def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool:
-    """Return True if the companions of a fit of the target are not the candidates.
+def lacks_candidates(fit: Refinement, candidates: Candidates) -> bool:
+    """Return True if the companions of a fit are not the candidates.
 
     They are if every companion is at the place of one candidate and about as bright, and the other
-    way round. Positions of candidates refer to the first frame of the first fit.
+    way round.
     """
-    return any(
-        len(fit.companions) != len(candidates) or bool((~_confirmed(fit, fits, candidates)).any())
-        for fit in fits
-        if not has_only_reference_stars(fit)
-    )
+    return len(fit.companions) != len(candidates) or not _confirmed(fit, candidates).all()
 
 
-def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
+def in_derivatives(fit: Refinement, offsets: Tensor) -> Tensor:
     """Which sources (k, 2), x, y from the star, have light in the derivatives of the fit, (k,).
 
     Errors of such a source from the linear model already contain the star's errors and the
     errors of the source's image.
     """
-    fit = templates.fit
-    first = fit.frames[0].observation
-    places = torch.from_numpy(first.turned(offsets.numpy(), templates.origin.observation))
     companions = torch.from_numpy(fit.bright_companions[:, 1:])
-    return (torch.cdist(places, companions) < _SAME_SOURCE_LAMBDA_D * fit.model.resolution).any(
+    return (torch.cdist(offsets, companions) < _SAME_SOURCE_LAMBDA_D * fit.model.resolution).any(
         dim=1
     )
 
 
-def unconfirmed_companions(
-    fits: Sequence[Refinement], candidates: Candidates
-) -> NDArray[np.float64]:
-    """Companions of the target's fits that are not among the candidates, (k, 3).
+def unconfirmed_companions(fit: Refinement, candidates: Candidates) -> NDArray[np.float64]:
+    """Companions of the fit that are not among the candidates, (k, 3).
 
-    Contrast, and x and y from the star in the first frame of their fit, arcsec; candidates'
-    positions refer to the first frame of the first fit.
+    Contrast, and x and y from the star in the first frame, arcsec.
     """
-    parts = [
-        fit.companions[~_confirmed(fit, fits, candidates)]
-        for fit in fits
-        if not has_only_reference_stars(fit)
-    ]
-    return np.concatenate([np.zeros((0, 3)), *parts])
+    return fit.companions[~_confirmed(fit, candidates)]
 
 
-def _confirmed(
-    fit: Refinement, fits: Sequence[Refinement], candidates: Candidates
-) -> NDArray[np.bool_]:
+def _confirmed(fit: Refinement, candidates: Candidates) -> NDArray[np.bool_]:
     """Which companions of a fit are candidates, (companions,)."""
-    roll = fit.frames[0].observation.roll_from(fits[0].frames[0].observation)
-    places = np.array([planet.offset for planet in candidates.planets(roll)]).reshape(1, -1, 2)
     contrasts = candidates.contrasts.numpy()
-    near = np.hypot(*np.moveaxis(fit.companions[:, None, 1:] - places, -1, 0))
+    away = fit.companions[:, None, 1:] - candidates.offsets.numpy()
+    near = np.hypot(*np.moveaxis(away, -1, 0))
     difference = np.abs(fit.companions[:, None, 0] - contrasts)
     allowed = np.hypot(
         _CONTRAST_RATIO * contrasts, _CONTRAST_SIGMAS * fit.companion_errors[:, None, 0]
@@ -421,25 +386,12 @@ def are_companions(fit: Refinement, candidates: Candidates) -> NDArray[np.bool_]
     return np.asarray(near.any(axis=1))
 
 
-def with_companions(
-    fits: Sequence[Refinement], candidates: Candidates, progress: bool = False
-) -> list[Refinement]:
-    """Refine all fits of the target again, with the candidates as companions of the star.
-
-    Positions of candidates refer to the first frame of the first fit.
-    """
-    origin = fits[0].frames[0].observation
+def with_companions(fit: Refinement, candidates: Candidates, progress: bool = False) -> Refinement:
+    """Refine the star again, with the candidates as its companions."""
     # Without parameters of its own, a bright companion biases the fitted wavefront beyond the range
     # of the linear model.
-    refined = []
-    for fit in fits:
-        if not has_only_reference_stars(fit):
-            # Companions of a fit have the orientation of its own first frame.
-            roll = fit.frames[0].observation.roll_from(origin)
-            again = refine_again(fit, companions=candidates.planets(roll), progress=progress)
-            fit = replace(again, seconds=fit.seconds + again.seconds)
-        refined.append(fit)
-    return refined
+    again = refine_again(fit, companions=candidates.planets(), progress=progress)
+    return replace(again, seconds=fit.seconds + again.seconds)
 
 
 def without_light(
@@ -474,7 +426,7 @@ _SHIFT_ARCSEC = 2e-3
 
 
 def with_position_of_star(
-    groups: Sequence[Group], candidates: Candidates, place: Tensor | None = None
+    templates: Templates, candidates: Candidates, place: Tensor | None = None
 ) -> Candidates:
     """Add the error of the star's position to the covariance of candidates' positions.
 
@@ -488,39 +440,35 @@ def with_position_of_star(
     # of a companion whose light counts in the derivatives by the star's unknowns already
     # contain the star's errors, and do not change.
     places = candidates.offsets if place is None else place[None]
-    rates = [_rates(groups, each) for each in places]
+    changes = torch.stack([_rates(templates, each) for each in places], dim=2)
+    changes = changes.expand(-1, -1, count)
+    changes = torch.where(in_derivatives(templates.fit, candidates.offsets), 0.0, changes)
+    # A companion whose place is not known says nothing about the place of the star.
+    linear = templates.fit.linear
+    of_star = torch.tensor([each.name != "companions" for each in linear.unknowns])
+    combinations = torch.zeros(len(of_star), 2 * count, dtype=torch.float64)
+    combinations[of_star] = changes.flatten(1)
     covariance = candidates.covariance.clone()
-    for k, (_, templates) in enumerate(groups):
-        changes = torch.stack([each[k] for each in rates], dim=2).expand(-1, -1, count)
-        changes = torch.where(in_derivatives(templates, candidates.offsets), 0.0, changes)
-        # A companion whose place is not known says nothing about the place of the star.
-        linear = templates.fit.linear
-        of_star = torch.tensor([each.name != "companions" for each in linear.unknowns])
-        combinations = torch.zeros(len(of_star), 2 * count, dtype=torch.float64)
-        combinations[of_star] = changes.flatten(1)
-        covariance[count:, count:] += linear.covariances(combinations)
+    covariance[count:, count:] += linear.covariances(combinations)
     return replace(candidates, covariance=covariance)
 
 
-def _rates(groups: Sequence[Group], offset: Tensor) -> list[Tensor]:
-    """Change of a measured offset by the unknowns of each group, (unknowns, 2), in arcsec."""
+def _rates(templates: Templates, offset: Tensor) -> Tensor:
+    """Change of a measured offset by the unknowns of the star, (unknowns, 2), in arcsec."""
+    linear = templates.linear
     matrix = torch.zeros(3, 3, dtype=torch.float64)
-    gradients = []
-    for linear, templates in groups:
-        gradient = torch.zeros(len(linear.vector), 3, dtype=torch.float64)
-        for k in templates.frames:
-            of_frame, by_row = _offset_products(linear, templates, k, offset)
-            matrix += of_frame
-            gradient += linear.frames[k].onto_unknowns(by_row, len(gradient))
-        gradients.append(gradient)
-    return [torch.linalg.solve(matrix, gradient.T)[1:].T for gradient in gradients]
+    gradient = torch.zeros(len(linear.vector), 3, dtype=torch.float64)
+    for k in templates.frames:
+        of_frame, by_row = _offset_products(templates, k, offset)
+        matrix += of_frame
+        gradient += linear.frames[k].onto_unknowns(by_row, len(gradient))
+    return torch.linalg.solve(matrix, gradient.T)[1:].T
 
 
-def _offset_products(
-    linear: LinearModel, templates: Templates, k: int, offset: Tensor
-) -> tuple[Tensor, Tensor]:
+def _offset_products(templates: Templates, k: int, offset: Tensor) -> tuple[Tensor, Tensor]:
     """B C^-1 B^T, (3, 3), of a source in one frame, and B C^-1 dI/du by row, (rows, 3)."""
-    frame, fitted = linear.frames[k], templates.frames[k]
+    linear, fitted = templates.linear, templates.frames[k]
+    frame = linear.frames[k]
     model = coarse_copy(fitted.model)
     # Shifts hardly depend on the wavelength.
     model = model.at_wavelengths(model.bandpass.thinned(1)[1])
@@ -559,16 +507,16 @@ _OWN_ERROR_SNR = 25.0
 
 
 def candidate_errors(
-    groups: Sequence[Group], candidates: Candidates, factor: ErrorFactor
+    templates: Templates, candidates: Candidates, factor: ErrorFactor
 ) -> NDArray[np.float64]:
     """Relative calibration errors of candidates, (2, k), see `calibration_errors`."""
     factors = torch.from_numpy(factor.of(candidates.offsets))
     snr = torch.from_numpy(candidates.snr(factor))
-    return calibration_errors(groups, candidates.offsets, snr, factors).numpy()
+    return calibration_errors(templates, candidates.offsets, snr, factors).numpy()
 
 
 def calibration_errors(
-    groups: Sequence[Group], offsets: Tensor, snr: Tensor, factors: Tensor
+    templates: Templates, offsets: Tensor, snr: Tensor, factors: Tensor
 ) -> Tensor:
     """Relative errors of contrasts by the star's flux and by the source's image, (2, k), float64.
 
@@ -584,25 +532,21 @@ def calibration_errors(
     # of the star's flux, see `star_flux_error`, which is added. Errors of a companion whose light
     # counts in the derivatives by the star's unknowns contain the posterior's already; only this is
     # added.
-    frames = sum(len(templates.frames) for _, templates in groups)
-    variance = torch.zeros(2 * count, dtype=torch.float64)
-    for linear, templates in groups:
-        changes = torch.zeros(len(linear.vector), 2 * count, dtype=torch.float64)
-        contained = in_derivatives(templates, offsets)
-        for k, fitted in templates.frames.items():
-            frame = linear.frames[k]
-            on_rows = torch.zeros(len(frame.rows), 2 * count, dtype=torch.float64)
-            for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
-                if linear.unknowns[unknown].name == "flux":
-                    on_rows[row, :count] = 1 / fitted.flux
-            for j in torch.nonzero((snr > _OWN_ERROR_SNR) & ~contained).flatten().tolist():
-                by_modes = _by_modes(templates, k, frame, offsets[j])
-                on_rows[frame.first_mode :, [j, count + j]] = by_modes[:, None]
-            on_rows[:, contained.repeat(2)] = 0.0
-            changes += frame.onto_unknowns(on_rows, len(linear.vector)) / frames
-        variance += linear.variances(changes)
-    errors = factors * variance.sqrt().reshape(2, count)
-    untied = sum(star_flux_error(templates.fit) for _, templates in groups) / len(groups)
+    linear, contained = templates.linear, in_derivatives(templates.fit, offsets)
+    changes = torch.zeros(len(linear.vector), 2 * count, dtype=torch.float64)
+    for k, fitted in templates.frames.items():
+        frame = linear.frames[k]
+        on_rows = torch.zeros(len(frame.rows), 2 * count, dtype=torch.float64)
+        for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
+            if linear.unknowns[unknown].name == "flux":
+                on_rows[row, :count] = 1 / fitted.flux
+        for j in torch.nonzero((snr > _OWN_ERROR_SNR) & ~contained).flatten().tolist():
+            by_modes = _by_modes(templates, k, frame, offsets[j])
+            on_rows[frame.first_mode :, [j, count + j]] = by_modes[:, None]
+        on_rows[:, contained.repeat(2)] = 0.0
+        changes += frame.onto_unknowns(on_rows, len(linear.vector)) / len(templates.frames)
+    errors = factors * linear.variances(changes).sqrt().reshape(2, count)
+    untied = star_flux_error(templates.fit)
     return torch.stack([torch.hypot(errors[0], torch.full_like(errors[0], untied)), errors[1]])
 
 
@@ -625,13 +569,10 @@ def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) 
 # Caveats about the candidates of a search.
 
 
-def count_rolls(fits: Sequence[Refinement]) -> int:
+def count_rolls(fit: Refinement) -> int:
     """Number of orientations of the target's frames that differ by more than a degree."""
     angles = sorted(
-        each.observation.position_angle
-        for fit in fits
-        for each in fit.frames
-        if not each.observation.reference
+        each.observation.position_angle for each in fit.frames if not each.observation.reference
     )
     steps = np.diff(angles, append=angles[0] + 360)
     return max(1, int((steps > 1).sum()))
@@ -639,8 +580,8 @@ def count_rolls(fits: Sequence[Refinement]) -> int:
 
 def caveats(detection: Any) -> str:
     """Sources that only the fit of a `Detection` has, and what a single roll cannot tell."""
-    fits = detection.fits
-    sources = unconfirmed_companions(fits, detection.sources) if fits else np.zeros((0, 3))
+    fit = detection.stored_fit
+    sources = np.zeros((0, 3)) if fit is None else unconfirmed_companions(fit, detection.sources)
     remarks = [
         f"A possible source of contrast {contrast:.1e} at {math.hypot(x, y):.2f} arcsec was "
         "fitted with the star; the search does not confirm it."
@@ -698,8 +639,8 @@ def sources_of_references(fit: Refinement) -> dict[int, ReferenceSource]:
             stars.setdefault(frame.observation.target, []).append(k)
     sources = {}
     for star, places in stars.items():
-        templates = _templates_of(fit, places)
-        brightest = _brightest_source(fit, templates, places)
+        templates = Templates(fit, places)
+        brightest = _brightest_source(templates)
         if brightest is None:
             continue
         contrast, x, y, snr = brightest
@@ -715,9 +656,7 @@ def sources_of_references(fit: Refinement) -> dict[int, ReferenceSource]:
     return sources
 
 
-def _brightest_source(
-    fit: Refinement, templates: Templates, places: Sequence[int]
-) -> tuple[float, float, float, float] | None:
+def _brightest_source(templates: Templates) -> tuple[float, float, float, float] | None:
     """Contrast, x, y and S/N of the most significant source in frames of one reference star."""
     away = np.hypot(templates.grid[..., 0], templates.grid[..., 1])
     rows, columns = (each.ravel() for each in np.indices(away.shape))
@@ -725,31 +664,22 @@ def _brightest_source(
         (away.ravel() > _INNER_ARCSEC) & (rows % _GRID_PIXELS == 0) & (columns % _GRID_PIXELS == 0)
     )
     rows, columns = rows[chosen], columns[chosen]
-    snr = _approximate_snr(fit, places, rows, columns)
+    snr = _approximate_snr(templates.fit, list(templates.frames), rows, columns)
     peak = int(snr.argmax())
     if snr[peak] < _REFERENCE_PEAK_SNR:
         return None
     # The search steps over pixels, and a source may be between them.
-    group, pixel = (fit.star_only, templates), pixel_width(templates.grid)
     row, column = rows[peak : peak + 1], columns[peak : peak + 1]
-    products = fit.star_only.weigh(templates.at_pixels(row, column))
+    products = templates.linear.weigh(templates.at_pixels(row, column))
     contrast = (products.numerator / products.information).numpy()
     start = Candidates.at(templates.grid[row, column], contrast)
-    source = refine_candidates([group], start, _GRID_PIXELS * pixel, _PLACE_STEPS)
+    reach = _GRID_PIXELS * pixel_width(templates.grid)
+    source = refine_candidates(templates, start, reach, _PLACE_STEPS)
     measured = float(source.snr(ErrorFactor.constant(1.0))[0])
     if measured < _REFERENCE_SOURCE_SNR:
         return None
     x, y = source.offsets[0].tolist()
     return float(source.contrasts[0]), x, y, measured
-
-
-def _templates_of(fit: Refinement, places: Sequence[int]) -> Templates:
-    """Templates in some frames of a reference star, which takes the part of the target."""
-    frames = [
-        replace(frame, observation=replace(frame.observation, reference=k not in places))
-        for k, frame in enumerate(fit.frames)
-    ]
-    return Templates(replace(fit, frames=tuple(frames)), frames[places[0]])
 
 
 def _approximate_snr(
@@ -761,7 +691,7 @@ def _approximate_snr(
     # Dithers move the star by a fraction of a pixel, so that templates of the first frame do for
     # all.
     linear, first = fit.star_only, places[0]
-    templates = _templates_of(fit, [first])
+    templates = Templates(fit, [first])
     cleaned = torch.zeros_like(linear.cleaned[first])
     weight = torch.zeros_like(cleaned)
     for k in places:

@@ -31,14 +31,14 @@ lambda/D at S/N 5."""
 def stated_limits(detection: Detection) -> tuple[Image, Image]:
     """Separations, arcsec, and stated limits in units of light, see `FrameFit.star_light`."""
     curve = detection.contrast_curve
-    light = detection.fits[0].frames[0].star_light
+    light = detection.fit.frames[0].star_light
     return curve["separation"].to_value("arcsec"), light * np.asarray(curve["contrast"])
 
 
 def deeper(first: Detection, second: Detection) -> Detection:
     """Join two searches of the same frames: at every separation, the one with the deeper limit.
 
-    Contrasts are relative to the star of the first search, whose fits the result has. It is the
+    Contrasts are relative to the star of the first search, whose fit the result has. It is the
     first search itself where the second is nowhere deeper.
     """
     separations, limits = stated_limits(first)
@@ -51,7 +51,7 @@ def deeper(first: Detection, second: Detection) -> Detection:
     # Between the separations of the curve, the nearest one decides.
     nearest = np.abs(separation_of(first.grid)[..., None] - separations).argmin(axis=-1)
     region = is_deeper[nearest]
-    one, two = (each.fits[0].frames[0].star_light for each in (first, second))
+    one, two = (each.fit.frames[0].star_light for each in (first, second))
     scale = two / one
 
     def chosen(one: Image, other: Image) -> Image:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor, curve_table
 from pyklip_diffrender.detection.field import Image, Sky
-from pyklip_diffrender.detection.templates import Group, groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing, require_new, write_fits, write_table
 from pyklip_diffrender.io.headers import fits_unit, known_text
@@ -189,7 +188,7 @@ def _hdus_of(detection: Any) -> fits.HDUList:
         "contrast_curve": _table_facts(detection.contrast_curve),
         "observation": about,
         "provenance": detection.provenance,
-        "fits": detection._digests,
+        "fit": detection._digest,
     }
     return fits.HDUList(
         [
@@ -246,7 +245,7 @@ def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
 
 
 def _searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a detection that do not need its fits; raises as `_maps_of`."""
+    """Return the fields of a detection that do not need its fit; raises as `_maps_of`."""
     curve = facts["contrast_curve"]
     return {
         "threshold": facts["threshold"],
@@ -259,7 +258,7 @@ def _searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _computed_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the cached properties that a new detection computes from its fits, by name."""
+    """Return the cached properties that a new detection computes from its fit, by name."""
     stars = sum(hdu.name == "SUBTRACTED" for hdu in hdus)
     return {
         "observation": observation_of(hdus, facts["observation"], 0),
@@ -271,7 +270,7 @@ def _computed_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
             key: list(value) if isinstance(value, tuple) else value
             for key, value in facts["provenance"].items()
         },
-        "_digests": facts["fits"],
+        "_digest": facts["fit"],
         "rolls": facts["rolls"],
     }
 
@@ -311,15 +310,15 @@ def digest(fit: Refinement) -> str:
 
 
 def provenance_of(detection: Any) -> dict[str, object]:
-    """Facts about the fits and the search of a `Detection`, by name."""
+    """Facts about the fit and the search of a `Detection`, by name."""
     first = detection.observation
     return {
         "software": __version__,
         "target": first.target,
         "filter": first.filter,
         "image_mask": known_text(first.header, "CORONMSK"),
-        "observations": [f.observation.name for fit in detection.fits for f in fit.frames],
-        **detection.fits[0].summary(),
+        "observations": [each.observation.name for each in detection.fit.frames],
+        **detection.fit.summary(),
         "scatter": detection.scatter,
         "threshold": detection.threshold,
         **detection.sky.facts,
@@ -356,32 +355,29 @@ def write_detection(detection: Any, folder: Path, *, overwrite: bool) -> list[Pa
     return [*written, detection.write_astrometry(positions, overwrite=overwrite)]
 
 
-def read_detection(
-    path: Path, fit: Refinement | Sequence[Refinement] | None
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_detection(path: Path, fit: Refinement | None) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a file of `write_detection`; see `Detection.read`.
 
     Returns the fields of the class, but for `other`, and the cached properties that a new detection
-    computes from its fits, by name.
+    computes from its fit, by name.
     """
     path = path / "detection.fits" if path.is_dir() else path
-    searched = (fit,) if isinstance(fit, Refinement) else tuple(fit or ())
     with reading(path, "Detection") as (hdus, facts):
-        groups = _groups_of(searched, facts["fits"], path) if searched else ()
-        fields = {"fits": searched, "groups": groups, "path": path, **_searched_of(hdus, facts)}
+        if fit is not None:
+            _require_searched(fit, facts["fit"], path)
+        fields = {"stored_fit": fit, "path": path, **_searched_of(hdus, facts)}
         return fields, _computed_of(hdus, facts)
 
 
-def searched_fits(
-    path: Path, digests: Sequence[str]
-) -> tuple[tuple[Refinement, ...], tuple[Group, ...]]:
-    """Fits in the folder of a detection's file, with their linear models and templates.
+def searched_fit(path: Path, expected: str) -> Refinement:
+    """The fit in the folder of a detection's file, with its linear model.
 
     Raises `IncompatibleSetupError` if there is no fit with a linear model, or one of another
-    `digest`.
+    `digest` than `expected`.
     """
-    searched = (_fit_beside(path),)
-    return searched, _groups_of(searched, digests, path)
+    fit = _fit_beside(path)
+    _require_searched(fit, expected, path)
+    return fit
 
 
 def fit_name(detection: str) -> str:
@@ -415,15 +411,10 @@ def _fit_beside(path: Path) -> Refinement:
     return fit
 
 
-def _groups_of(
-    searched: Sequence[Refinement], digests: Sequence[str], path: Path
-) -> tuple[Group, ...]:
-    """Linear models and templates of fits, if the detection in a file is of these fits."""
-    if [digest(fit) for fit in searched] != list(digests):
+def _require_searched(fit: Refinement, expected: str, path: Path) -> None:
+    """Raise for a fit of another `digest` than the one that was searched for a detection's file."""
+    if digest(fit) != expected:
         raise IncompatibleSetupError(
-            f"{path}: the fit is not the one that was searched for this detection"
-            + (f", which has {len(digests)} fits" if len(searched) != len(digests) else "")
-            + ". Pass the attribute `fits` of the detection that was written: "
-            "Detection.read(path, fit=fits)"
+            f"{path}: the fit is not the one that was searched for this detection. Pass the "
+            "attribute `fit` of the detection that was written: Detection.read(path, fit=fit)"
         )
-    return tuple(groups_of(searched))

@@ -39,12 +39,7 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import without_light
 from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.field import Image, Sky, pixel_width, separation_of
-from pyklip_diffrender.detection.templates import (
-    Templates,
-    combine_frames,
-    groups_of,
-    has_only_reference_stars,
-)
+from pyklip_diffrender.detection.templates import Templates, combine_frames
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.headers import fits_unit, set_keyword
@@ -298,7 +293,7 @@ class Disk:
         set_keyword(sources.header, "DRGAIN", self.gain)
         hdus = fits.HDUList(
             [
-                primary_hdu(first, self.fit.summary(), Sky.of([self.fit]).mjd),
+                primary_hdu(first, self.fit.summary(), Sky.of(self.fit).mjd),
                 image_hdu(self.image, "IMAGE", unit, wcs),
                 image_hdu(self.error, "IMAGE_ERROR", unit, wcs),
                 *(
@@ -376,10 +371,6 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
     require_positive(inner=inner)
     if not fit.status.usable:
         raise IncompatibleSetupError(f"fit_disk: the fit ended as {fit.status}")
-    if has_only_reference_stars(fit):
-        raise IncompatibleSetupError(
-            "fit_disk: expected frames of the target, got a reference star"
-        )
     original = [frame.observation for frame in fit.frames]
     sources = _fit_sources(fit, _positions(fit.frames[0].grid, inner))
     gain, extended = sources.gain, None
@@ -482,7 +473,8 @@ def _fit_sources(
 
     With `only_extended`, point sources are left out after the fit.
     """
-    ((linear, templates),) = groups_of([fit])
+    templates = Templates(fit)
+    linear = templates.linear
     images = templates.at_pixels(*pixels)
     flux, before = fit.frames[0].flux, np.zeros(len(pixels[0]))
     if start is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -191,10 +190,10 @@ class Sky:
     vega: float | None = None
 
     @classmethod
-    def of(cls, fits: Sequence[Refinement], scatter: float = 1.0) -> Sky:
+    def of(cls, fit: Refinement, scatter: float = 1.0) -> Sky:
         """Relation of the target's frames to the sky, with errors multiplied by `scatter`."""
-        first = fits[0].frames[0].observation
-        frames = [f for fit in fits for f in fit.frames if not f.observation.reference]
+        first = fit.frames[0].observation
+        frames = [each for each in fit.frames if not each.observation.reference]
         # Where the middle of an exposure is not known, its beginning is near enough for an orbit.
         dates = [
             f.observation.date if f.observation.mid_date is None else f.observation.mid_date
@@ -207,11 +206,9 @@ class Sky:
         if np.isfinite(scales).all():
             flux = np.mean(scales * [frame.flux for frame in frames])
             error = scatter * np.mean(scales * [frame.errors["flux"][0] for frame in frames])
-            untied = np.mean([star_flux_error(fit) for fit in fits])
             # As the catalogue states it, because the star follows within a fraction of its error.
-            stated = [each for fit in fits if (each := fit.catalogue_flux) is not None]
-            value = np.mean(stated) if len(stated) == len(fits) else flux
-            star = (float(value), float(np.hypot(error, untied * flux)))
+            value = flux if fit.catalogue_flux is None else fit.catalogue_flux
+            star = (float(value), float(np.hypot(error, star_flux_error(fit) * flux)))
         return cls(
             first.north,
             float(np.mean(known)) if known else None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -28,12 +28,12 @@ from pyklip_diffrender.detection.field import (
     require_inside,
     separation_of,
 )
-from pyklip_diffrender.detection.templates import Group, has_only_reference_stars, weigh
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.tables import Column, add_columns
 from pyklip_diffrender.io.units import east_and_north, to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.refinement import FrameFit, Refinement
+from pyklip_diffrender.refinement import Refinement
 
 _STAR_REFINEMENTS = 5
 """Largest number of refinements of the star for a bright extended source."""
@@ -43,7 +43,7 @@ _SETTLED_AMPLITUDE_SIGMAS = 0.2
 
 
 def contrasts_at(
-    groups: Sequence[Group], offsets: ArrayLike, factor: ErrorFactor
+    templates: Templates, offsets: ArrayLike, factor: ErrorFactor
 ) -> tuple[QTable, Image]:
     """Contrasts of point sources at x, y (k, 2), one at a time; see `Detection.measure`.
 
@@ -53,14 +53,14 @@ def contrasts_at(
     places = torch.from_numpy(np.atleast_2d(to_arcsec(offsets, "offsets")))
     if places.ndim != 2 or places.shape[1] != 2:
         raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
-    require_inside(places.numpy(), groups[0][1].grid)
-    products = weigh(groups, lambda templates: templates.at(places))
+    require_inside(places.numpy(), templates.grid)
+    products = templates.linear.weigh(templates.at(places))
     factors = factor.of(places)
     error = factors / products.information.sqrt().numpy()
     contrast = (products.numerator / products.information).numpy()
     snr = contrast / error
     calibration = calibration_errors(
-        groups, places, torch.from_numpy(snr), torch.from_numpy(factors)
+        templates, places, torch.from_numpy(snr), torch.from_numpy(factors)
     ).numpy()
     table = QTable(
         {
@@ -75,26 +75,22 @@ def contrasts_at(
 
 
 def measured_shape(
-    fits: Sequence[Refinement],
-    groups: Sequence[Group],
-    image: ArrayLike,
-    scatter: float,
-    relinearise: float,
+    templates: Templates, image: ArrayLike, scatter: float, relinearise: float
 ) -> tuple[float, float]:
     """Amplitude of an extended source and its error; see `Detection.measure_shape`."""
     light = np.ascontiguousarray(image, dtype=float)
-    expected = groups[0][1].grid.shape[:2]
+    expected = templates.grid.shape[:2]
     if light.shape != expected:
         raise ShapeError(f"image: got {light.shape}, expected {expected}")
     shape = torch.from_numpy(light)
-    amplitude, error = _amplitude(groups[0][0], shape)
+    amplitude, error = _amplitude(templates.linear, shape)
     total, bright = amplitude, amplitude > relinearise * error
-    single_frame = len(fits) == 1 and len(fits[0].frames) == 1
+    single_frame = len(templates.fit.frames) == 1
     factor = scatter
     # Light of a bright source biases the wavefront, and part of it is taken for the star. Without
     # the light that was found so far, the next amplitude is what is left.
     for _ in range(_STAR_REFINEMENTS if bright and single_frame else 0):
-        fit = without_light(fits[0], {0: total * light})
+        fit = without_light(templates.fit, {0: total * light})
         amplitude, error = _amplitude(fit.star_only, shape)
         total += amplitude
         factor = 1.0 if fit.status.calibrated else scatter
@@ -110,33 +106,19 @@ def _amplitude(linear: LinearModel, shape: torch.Tensor) -> tuple[float, float]:
     return float(products.numerator[0]) / information, information**-0.5
 
 
-def subtracted_frames(
-    fits: Sequence[Refinement], groups: Sequence[Group], candidates: Candidates
-) -> tuple[Image, ...]:
-    """Star-subtracted frames of all fits; see `Detection.subtracted`."""
+def subtracted_frames(templates: Templates, candidates: Candidates) -> tuple[Image, ...]:
+    """Star-subtracted frames of the fit; see `Detection.subtracted`."""
     images: list[Image] = []
-    remaining = iter(groups)
-    for fit in fits:
-        if has_only_reference_stars(fit):
-            images += [_residual(frame) for frame in fit.frames]
-            continue
-        linear, templates = next(remaining)
-        light = candidates.light(templates)
-        # Candidates are removed before the star is estimated, and added again afterwards.
-        cleaned = linear.clean(light) if light else {}
-        for k, frame in enumerate(linear.frames):
-            residual = linear.cleaned[k]
-            if cleaned:
-                residual = residual - cleaned[k][0]
-            image = residual / frame.weight + light.get(k, torch.zeros(1))[0]
-            images.append(torch.where(frame.weight > 0, image, torch.nan).numpy())
+    linear, light = templates.linear, candidates.light(templates)
+    # Candidates are removed before the star is estimated, and added again afterwards.
+    cleaned = linear.clean(light) if light else {}
+    for k, frame in enumerate(linear.frames):
+        residual = linear.cleaned[k]
+        if cleaned:
+            residual = residual - cleaned[k][0]
+        image = residual / frame.weight + light.get(k, torch.zeros(1))[0]
+        images.append(torch.where(frame.weight > 0, image, torch.nan).numpy())
     return tuple(images)
-
-
-def _residual(frame: FrameFit) -> Image:
-    """Residual of a frame of a reference star that was fitted without the target."""
-    combined = frame.observation.combined()
-    return np.where(combined.valid[0], combined.data[0] - frame.star, np.nan)
 
 
 # Tables of candidates and of measurements, with what they mean on the sky.
@@ -315,7 +297,7 @@ def _table(columns: list[Column], first: tuple[str, ...]) -> QTable:
     return add_columns(QTable(), ordered)
 
 
-# Errors and thresholds of a search, from the residuals of its fits.
+# Errors and thresholds of a search, from the residuals of its fit.
 
 _CHI2_RINGS_ARCSEC = (0.2, 0.6, 1.2, 2.0)
 """Separations between which chi-squared is stated, arcsec."""
@@ -324,79 +306,73 @@ _DEGENERATE_EIGENVALUE = 1e-6
 """Relative eigenvalue below which sources are degenerate with each other."""
 
 
-def follows_scatter(fits: Sequence[Refinement]) -> bool:
+def follows_scatter(fit: Refinement) -> bool:
     """Whether errors are multiplied by the scatter of the S/N, and not by chi-squared alone."""
     # On real frames, and where a fit does not explain its data, errors of the model that
     # neighbouring pixels share do not show in chi-squared.
-    explained = all(fit.status.calibrated for fit in fits)
-    return not explained or fits[0].frames[0].observation.is_nircam
+    return not fit.status.calibrated or fit.frames[0].observation.is_nircam
 
 
 def significance_of(
-    fits: Sequence[Refinement],
-    maps: Maps,
-    sources: Tensor,
-    inner: float,
-    scatter: float | None = None,
+    maps: Maps, sources: Tensor, inner: float, scatter: float | None = None
 ) -> Significance:
-    """Errors and thresholds of the S/N maps of fits, with sources at x, y, (k, 2), arcsec.
+    """Errors and thresholds of the S/N map of a fit, with sources at x, y, (k, 2), arcsec.
 
     `inner` is the smallest separation of a source, arcsec; `scatter` replaces the factor.
     """
-    measured = scatter is None and follows_scatter(fits)
+    fit = maps.templates.fit
+    measured = scatter is None and follows_scatter(fit)
     return Significance(
         maps.grid,
         maps.starlight,
         maps.correlation,
         inner,
-        fits[0].model.resolution,
-        error_inflation(fits, maps.groups, sources) if scatter is None else scatter,
+        fit.model.resolution,
+        error_inflation(maps.templates, sources) if scatter is None else scatter,
         measured,
         maps.structures if measured else 0.0,
     )
 
 
-def default_factor(
-    fits: Sequence[Refinement], groups: Sequence[Group], sources: Candidates
-) -> ErrorFactor:
+def default_factor(templates: Templates, sources: Candidates) -> ErrorFactor:
     """Factor for the errors of sources that were fitted together, as in a search."""
-    if not follows_scatter(fits):
-        return ErrorFactor.constant(error_inflation(fits, groups, sources.offsets))
-    maps = Maps(groups)
-    significance = significance_of(fits, maps, sources.offsets, fits[0].model.resolution)
+    if not follows_scatter(templates.fit):
+        return ErrorFactor.constant(error_inflation(templates, sources.offsets))
+    maps = Maps(templates)
+    significance = significance_of(maps, sources.offsets, templates.fit.model.resolution)
     return significance.factor(maps.snr(maps.without(sources)), sources.offsets)
 
 
-def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets: Tensor) -> float:
+def error_inflation(templates: Templates, offsets: Tensor) -> float:
     """Square root of the reduced chi-squared with the light of sources removed, at least 1.
 
-    The sources are at x, y, (k, 2), from the star, arcsec; some may coincide. It is 1 if a fit does
-    not explain its data, because its noise then includes a model error.
+    The sources are at x, y, (k, 2), from the star, arcsec; some may coincide. It is 1 if the fit
+    does not explain its data, because its noise then includes a model error.
     """
-    if not all(fit.status.calibrated for fit in fits):
+    fit = templates.fit
+    if not fit.status.calibrated:
         return 1.0
     # Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors.
     # Planets are not part of it: one of S/N 20 that is not removed would increase all errors by
     # 3 %. Therefore the sources are fitted together and removed first.
-    reduced = float(np.mean([fit.reduced_chi2 for fit in fits]))
-    companions = Candidates.of_fit(fits[0]).offsets
+    companions = Candidates.of_fit(fit).offsets
     # A ratio, because robust fits give outliers less weight in their linear models.
-    share = _reduced_chi2(groups, offsets) / _reduced_chi2(groups, companions)
-    return math.sqrt(max(1.0, reduced * share))
+    share = _reduced_chi2(templates, offsets) / _reduced_chi2(templates, companions)
+    return math.sqrt(max(1.0, fit.reduced_chi2 * share))
 
 
-def chi2_by_ring(groups: Sequence[Group], sources: Tensor, factor: ErrorFactor) -> QTable:
+def chi2_by_ring(templates: Templates, sources: Tensor, factor: ErrorFactor) -> QTable:
     """Chi-squared per pixel of the target's frames in rings about the star, without the sources.
 
     The table has inner and outer separation, arcsec, chi-squared per pixel, and the median error
     factor; `sources` are x, y, (k, 2), arcsec.
     """
     squares, distances = [], []
-    for (linear, templates), residuals in zip(groups, _residuals(groups, sources)[0], strict=True):
-        for k, fitted in templates.frames.items():
-            used = (linear.frames[k].weight > 0).numpy()
-            squares.append(residuals[k].numpy()[used] ** 2)
-            distances.append(separation_of(fitted.grid)[used])
+    residuals, _ = _residuals(templates, sources)
+    for k, fitted in templates.frames.items():
+        used = (templates.linear.frames[k].weight > 0).numpy()
+        squares.append(residuals[k].numpy()[used] ** 2)
+        distances.append(separation_of(fitted.grid)[used])
     square, distance = np.concatenate(squares), np.concatenate(distances)
     edges = [*(each for each in _CHI2_RINGS_ARCSEC if each < distance.max()), float(distance.max())]
     rows = []
@@ -416,30 +392,25 @@ def chi2_by_ring(groups: Sequence[Group], sources: Tensor, factor: ErrorFactor) 
     )
 
 
-def _reduced_chi2(groups: Sequence[Group], offsets: Tensor) -> float:
+def _reduced_chi2(templates: Templates, offsets: Tensor) -> float:
     """Reduced chi-squared of the data after the sources and all unknowns are fitted."""
-    pixels = sum(int((frame.weight > 0).sum()) for linear, _ in groups for frame in linear.frames)
-    residuals, independent = _residuals(groups, offsets)
-    chi2 = sum(float((part**2).sum()) for parts in residuals for part in parts)
+    pixels = sum(int((frame.weight > 0).sum()) for frame in templates.linear.frames)
+    residuals, independent = _residuals(templates, offsets)
+    chi2 = sum(float((part**2).sum()) for part in residuals)
     return chi2 / max(pixels - independent, 1)
 
 
-def _residuals(groups: Sequence[Group], offsets: Tensor) -> tuple[list[list[Tensor]], int]:
-    """Whitened residuals of all frames by group, and the number of independent sources in them."""
+def _residuals(templates: Templates, offsets: Tensor) -> tuple[list[Tensor], int]:
+    """Whitened residuals of all frames, and the number of independent sources in them."""
+    linear = templates.linear
     if not len(offsets):
-        return [list(linear.cleaned) for linear, _ in groups], 0
-    images = [templates.at(offsets) for _, templates in groups]
-    equations = [
-        linear.normal_equations(part) for (linear, _), part in zip(groups, images, strict=True)
-    ]
-    matrix, vector = (torch.stack(parts).sum(dim=0) for parts in zip(*equations, strict=True))
+        return list(linear.cleaned), 0
+    images = templates.at(offsets)
+    matrix, vector = linear.normal_equations(images)
     # Sources that coincide have equal images: the pseudo-inverse shares the light among them, and
     # the rank of the matrix is the number of unknowns that they are.
     contrasts = torch.linalg.pinv(matrix, rtol=_DEGENERATE_EIGENVALUE, hermitian=True) @ vector
     independent = int(torch.linalg.matrix_rank(matrix, rtol=_DEGENERATE_EIGENVALUE, hermitian=True))
-    residuals = []
-    for (linear, _), part in zip(groups, images, strict=True):
-        light = {k: torch.tensordot(contrasts, each, dims=1)[None] for k, each in part.items()}
-        cleaned = linear.clean(light)
-        residuals.append([each - cleaned[k][0] for k, each in enumerate(linear.cleaned)])
-    return residuals, independent
+    light = {k: torch.tensordot(contrasts, each, dims=1)[None] for k, each in images.items()}
+    cleaned = linear.clean(light)
+    return [each - cleaned[k][0] for k, each in enumerate(linear.cleaned)], independent

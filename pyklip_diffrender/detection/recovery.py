@@ -23,7 +23,6 @@ from pyklip_diffrender.detection.field import (
 )
 from pyklip_diffrender.detection.measurement import significance_of
 from pyklip_diffrender.detection.search_result import Detection
-from pyklip_diffrender.detection.templates import groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.tables import add_columns
@@ -97,7 +96,7 @@ def recover_planets(
         One row for each planet: where it was injected (as in the table of candidates), its
         contrast, and what `measured_planet` says of it.
     """
-    frames = [each for each in detection.fits[0].frames if not each.observation.reference]
+    frames = [each for each in detection.fit.frames if not each.observation.reference]
     curve = detection.contrast_curve
     rows: list[tuple[float, ...]] = []
     inner, outer = (float(end) for end in curve["separation"].value[[0, -1]])
@@ -169,7 +168,7 @@ def measured_planet(
     fit with which it was rendered.
     """
     sources, factor = detection.sources, detection.error_factor
-    unit = detection.fits[0].frames[0].star_light / star_light
+    unit = detection.fit.frames[0].star_light / star_light
     distances = np.hypot(*(sources.offsets.numpy() - place).T)
     if len(sources) and distances.min() < _SAME_ARCSEC:
         k = int(distances.argmin())
@@ -241,7 +240,7 @@ def completeness(
     Parameters
     ----------
     detection : Detection
-        With its fits and their linear models.
+        With its fit and the linear model.
     separations : array or Quantity, optional
         arcsec; by default every second of the contrast curve from its second on.
     strengths : sequence of float
@@ -264,7 +263,7 @@ def completeness(
     Raises
     ------
     IncompatibleSetupError
-        If the detection has no linear models, or no place is free.
+        If the detection has no linear model, or no place is free.
 
     Examples
     --------
@@ -279,9 +278,9 @@ def completeness(
     >>> table["completeness"].tolist()
     [0.0, 1.0]
     """
-    if not detection.fits:
+    if detection.stored_fit is None:
         raise IncompatibleSetupError(
-            "completeness: got a detection without its fits, expected one from detect or reduce"
+            "completeness: got a detection without its fit, expected one from detect or reduce"
         )
     searches = [_Searched.of(detection, inner, progress)]
     if detection.other is not None:
@@ -396,14 +395,14 @@ class _Searched:
 
     @classmethod
     def of(cls, detection: Detection, inner: float, progress: bool) -> _Searched:
-        maps, known = Maps(groups_of(detection.fits), progress), detection.sources
+        maps, known = Maps(detection.templates, progress), detection.sources
         return cls(
             maps,
-            significance_of(detection.fits, maps, known.offsets, inner),
+            significance_of(maps, known.offsets, inner),
             maps.without(known),
             known.offsets,
             detection.threshold,
-            detection.fits[0].frames[0].star_light,
+            detection.fit.frames[0].star_light,
         )
 
     def found(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +37,7 @@ from pyklip_diffrender.detection.field import (
 )
 from pyklip_diffrender.detection.measurement import chi2_by_ring, significance_of
 from pyklip_diffrender.detection.search_result import Detection
-from pyklip_diffrender.detection.templates import groups_of, has_only_reference_stars
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import require_positive, to_arcsec
 from pyklip_diffrender.refinement import Refinement, Status
@@ -72,7 +71,7 @@ def side_lobes(
     peak = np.unravel_index(np.nanargmax(scaled), scaled.shape)
     contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
     both = candidates.with_one_more(maps.grid[peak], contrast)
-    both = refine_candidates(maps.groups, both, pixel_width(maps.grid) / 2)
+    both = refine_candidates(maps.templates, both, pixel_width(maps.grid) / 2)
     sigmas = both.snr(factor)
     # The map has less of a source between pixels, and of one that the candidates stand for.
     if separation_of(both.offsets.numpy())[-1] >= inner or sigmas[-1] < threshold:
@@ -106,48 +105,37 @@ _UNEXPLAINED = (Status.MODEL_MISMATCH, Status.ITERATION_LIMIT)
 
 
 def with_raised_peaks(
-    fits: Sequence[Refinement],
-    maps: Maps,
-    candidates: Candidates,
-    inner: float,
-    progress: bool = False,
-) -> list[Refinement] | None:
+    maps: Maps, candidates: Candidates, inner: float, progress: bool = False
+) -> Refinement | None:
     """Refine the star again with the candidates and one of the highest peaks as companions.
 
-    The fits have the companion that lowers chi-squared most, or the first that explain
-    the data. None if none lowers it enough, or if the fits explain their data already.
+    The fit has the companion that lowers chi-squared most, or the first that explains
+    the data. None if none lowers it enough, or if the fit of the maps explains its data already.
     """
-    if not _unexplained(fits):
+    fit = maps.templates.fit
+    if not _unexplained(fit):
         return None
     snr = maps.snr(maps.without(candidates))
     allowed = reaching(maps.grid, inner)
     allowed &= far_from(
         maps.grid, candidates.offsets, _SUBTRACTION_RESIDUAL_PIXELS * pixel_width(maps.grid)
     )
-    best, least = None, _COMPANION_CHI2_RATIO * _chi2(fits)
+    best, least = None, _COMPANION_CHI2_RATIO * fit.chi2_per_pixel
     for peak in local_maxima(snr, allowed, _TRIED_PEAK_SNR, size=7)[:_MOST_TRIED_PEAKS]:
         contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
         tried = candidates.with_one_more(maps.grid[peak], contrast)
-        refined = with_companions(fits, tried, progress)
-        _log.info("a companion at %s lowers chi-squared to %.3g", maps.grid[peak], _chi2(refined))
-        if all(fit.status.usable for fit in refined) and _chi2(refined) < least:
-            best, least = refined, _chi2(refined)
+        refined = with_companions(fit, tried, progress)
+        chi2 = refined.chi2_per_pixel
+        _log.info("a companion at %s lowers chi-squared to %.3g", maps.grid[peak], chi2)
+        if refined.status.usable and chi2 < least:
+            best, least = refined, chi2
             if not _unexplained(best):
                 break
     return best
 
 
-def _unexplained(fits: Sequence[Refinement]) -> bool:
-    return any(fit.status in _UNEXPLAINED and fit.chi2_per_pixel > 1 for fit in fits)
-
-
-def _chi2(fits: Sequence[Refinement]) -> float:
-    """Mean chi-squared per pixel of the fits of the target."""
-    of_target = [fit for fit in fits if not has_only_reference_stars(fit)]
-    return float(np.mean([fit.chi2_per_pixel for fit in of_target]))
-
-
-Fits = Refinement | Sequence[Refinement]
+def _unexplained(fit: Refinement) -> bool:
+    return fit.status in _UNEXPLAINED and fit.chi2_per_pixel > 1
 
 
 _MAX_CANDIDATES = 10
@@ -166,9 +154,8 @@ light of structures of the detector would pass."""
 
 @dataclass(frozen=True)
 class _Outcome:
-    """Candidates of one search, in the order in which they were found, and the maps of the fits."""
+    """Candidates of one search, in the order in which they were found, and the maps of the fit."""
 
-    fits: Sequence[Refinement]
     maps: Maps
     candidates: Candidates
     factor: ErrorFactor
@@ -176,7 +163,7 @@ class _Outcome:
 
 
 def detect(
-    fits: Fits,
+    fit: Refinement,
     *,
     threshold: float = 5.0,
     inner: float = 0.2,
@@ -190,8 +177,8 @@ def detect(
 
     Parameters
     ----------
-    fits : Refinement or sequence of Refinement
-        Several refinements are independent measurements of the same sky.
+    fit : Refinement
+        Of all frames of the target that are searched together.
     threshold : float
         S/N above which a source is a candidate in Gaussian noise. Where errors are scaled to the
         scatter of the S/N, the S/N must be higher, so that noise exceeds it as rarely.
@@ -199,8 +186,8 @@ def detect(
         Smallest separation of candidates, arcsec.
     scatter : float, optional
         Factor by which all errors are multiplied. By default it is the square root of the reduced
-        chi-squared with the candidates removed if every fit explains its data, and at least 1. On
-        real frames, and where a fit does not explain its data, it is the standard deviation of the
+        chi-squared with the candidates removed if the fit explains its data, and at least 1. On
+        real frames, and if it does not explain its data, it is the standard deviation of the
         S/N away from candidates if that is larger, which depends on the star's light in the pixels
         and on the separation (see `ErrorFactor`): errors of the model that neighbouring pixels
         share do not show in chi-squared.
@@ -211,7 +198,7 @@ def detect(
         `Disk`. Separations without a pixel left have no row.
     relinearise : float
         S/N of a candidate above which the star is refined again with the candidates in the model,
-        because bright sources bias the wavefront about which the model is linearised. Where a fit
+        because bright sources bias the wavefront about which the model is linearised. Where the fit
         does not explain its data, any candidate may be the reason, and `threshold` is used instead.
     progress : bool
         Show progress bars.
@@ -223,9 +210,9 @@ def detect(
     Raises
     ------
     IncompatibleSetupError
-        For fits that failed or were read without their linear model, for fits of a reference
-        star only, for a threshold or separation that is not positive, or if `without_limits` has
-        another shape than the first frame.
+        For several fits, for a fit that failed or was read without its linear model, for a fit
+        whose first frame is of a reference star, for a threshold or separation that is not
+        positive, or if `without_limits` has another shape than the first frame.
 
     Examples
     --------
@@ -238,18 +225,18 @@ def detect(
     >>> len(dr.detect(fit).candidates)
     1
     """
-    fits = _checked(fits)
+    fit = _checked(fit)
     inner = float(to_arcsec(inner, "inner"))
     require_positive(threshold=threshold, inner=inner, scatter=scatter)
     if without_limits is not None:
-        _require_shape(np.shape(without_limits), fits[0].frames[0].grid.shape[:2])
+        _require_shape(np.shape(without_limits), fit.frames[0].grid.shape[:2])
 
-    outcome = _searched(fits, threshold, inner, scatter, relinearise, progress)
+    outcome = _searched(fit, threshold, inner, scatter, relinearise, progress)
     return _detection(outcome, threshold, separations, without_limits)
 
 
 def _searched(
-    fits: Sequence[Refinement],
+    fit: Refinement,
     threshold: float,
     inner: float,
     scatter: float | None,
@@ -258,26 +245,25 @@ def _searched(
 ) -> _Outcome:
     """The last search, with the star refined beside bright candidates; see `detect`."""
 
-    def look(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
-        maps = Maps(groups_of(fits), progress)
-        search = _PeakSearch(maps, fits, threshold, inner, scatter)
-        return _Outcome(fits, maps, *search.run(known))
+    def look(fit: Refinement, known: Candidates) -> _Outcome:
+        maps = Maps(Templates(fit), progress)
+        search = _PeakSearch(maps, threshold, inner, scatter)
+        return _Outcome(maps, *search.run(known))
 
-    def look_and_refine(fits: Sequence[Refinement]) -> _Outcome:
+    def look_and_refine(fit: Refinement) -> _Outcome:
         """Search, and search again with the candidates as companions if some are bright."""
-        last = look(fits, Candidates.of_fit(fits[0]))
+        last = look(fit, Candidates.of_fit(fit))
         if len(last.candidates) >= _MAX_CANDIDATES:
             return last
-        is_calibrated = all(fit.status.calibrated for fit in last.fits)
-        least = relinearise if is_calibrated else min(relinearise, threshold)
+        least = relinearise if fit.status.calibrated else min(relinearise, threshold)
         bright = last.candidates.snr(last.factor) > least
-        if not (bright.any() and lacks_candidates(last.fits, last.candidates)):
+        if not (bright.any() and lacks_candidates(fit, last.candidates)):
             return last
-        return look(with_companions(last.fits, last.candidates, progress), last.candidates)
+        return look(with_companions(fit, last.candidates, progress), last.candidates)
 
-    last = look_and_refine(fits)
+    last = look_and_refine(fit)
     if len(last.candidates) < _MAX_CANDIDATES:
-        better = with_raised_peaks(last.fits, last.maps, last.candidates, inner, progress)
+        better = with_raised_peaks(last.maps, last.candidates, inner, progress)
         last = last if better is None else look_and_refine(better)
     if len(last.candidates) >= _MAX_CANDIDATES:
         _log.warning(
@@ -300,8 +286,8 @@ def _detection(
     without_limits: NDArray[np.bool_] | None,
 ) -> Detection:
     """The maps, candidates and contrast curve of a search; see `detect`."""
-    fits, maps, candidates = outcome.fits, outcome.maps, outcome.candidates
-    factor = outcome.factor
+    maps, candidates, factor = outcome.maps, outcome.candidates, outcome.factor
+    fit = maps.templates.fit
     information = np.where(maps.information > 0, maps.information, np.nan)
     photon = np.where(maps.photon > 0, maps.photon, np.nan) ** -0.5
     factors = factor.of(maps.grid)
@@ -315,25 +301,24 @@ def _detection(
         for ring in ring_pixels(maps.grid, separations, most=error.size)
     ]
     return Detection(
-        fits=tuple(fits),
-        groups=maps.groups,
+        stored_fit=fit,
         contrast=maps.numerator / information,
         error=error,
         photon_error=photon,
         snr=maps.snr() / factors,
         residual_snr=maps.snr(maps.without(candidates)) / factors,
         error_factor=factor,
-        sources=with_position_of_star(maps.groups, candidates),
+        sources=with_position_of_star(maps.templates, candidates),
         false_alarm=_false_alarms(outcome),
-        rings=chi2_by_ring(maps.groups, candidates.offsets, factor),
+        rings=chi2_by_ring(maps.templates, candidates.offsets, factor),
         threshold=threshold,
         contrast_curve=contrast_table(
             separations,
             [error[*ring] for ring in rings],
             [photon[*ring] for ring in rings],
-            fits[0].model.resolution,
+            fit.model.resolution,
             factor,
-            Sky.of(fits).star_jansky,
+            Sky.of(fit).star_jansky,
         ),
         has_limits=has_limits,
         grid=maps.grid,
@@ -342,13 +327,13 @@ def _detection(
 
 def _false_alarms(outcome: _Outcome) -> NDArray[np.float64]:
     """Probabilities of noise making the candidates, (k,); NaN where the noise is not known."""
-    fits, candidates, factor = outcome.fits, outcome.candidates, outcome.factor
-    # The noise of fits that do not explain their data is not known.
-    if not all(fit.status.calibrated for fit in fits):
+    fit, candidates, factor = outcome.maps.templates.fit, outcome.candidates, outcome.factor
+    # The noise of a fit that does not explain its data is not known.
+    if not fit.status.calibrated:
         return np.full(len(candidates), np.nan)
     snr = candidates.snr(factor)
     false_alarm = outcome.significance.false_alarms(factor, snr, candidates.offsets)
-    if count_rolls(fits) == 1 and any(f.frames[0].observation.is_nircam for f in fits):
+    if count_rolls(fit) == 1 and fit.frames[0].observation.is_nircam:
         # Either noise or a structure of the detector, which only a second roll can tell.
         return 1 - (1 - false_alarm) * (1 - structures_in_single_roll(snr))
     return false_alarm
@@ -361,15 +346,18 @@ def _require_shape(actual: tuple[int, ...], expected: tuple[int, ...]) -> None:
         )
 
 
-def _checked(fits: Fits) -> list[Refinement]:
-    """Return the fits as a list; raise an exception if one of them failed."""
-    refinements = [fits] if isinstance(fits, Refinement) else list(fits)
-    if not refinements:
-        raise IncompatibleSetupError("detect: got no fit, expected a Refinement")
-    for fit in refinements:
-        if not fit.status.usable:
-            raise IncompatibleSetupError(f"detect: the fit ended as {fit.status}")
-    return refinements
+def _checked(fit: object) -> Refinement:
+    """Return the fit; raise an exception if it is none, or if it failed."""
+    if not isinstance(fit, Refinement):
+        count = f" of {len(fit)}" if isinstance(fit, list | tuple) else ""
+        raise IncompatibleSetupError(
+            f"detect: got a {type(fit).__name__}{count}, expected one Refinement. Fit frames of "
+            "one filter and date together, refine(model, [frame, ...], opd), and search that fit; "
+            "or search each fit alone, and combine([detection, ...]) the searches"
+        )
+    if not fit.status.usable:
+        raise IncompatibleSetupError(f"detect: the fit ended as {fit.status}")
+    return fit
 
 
 @dataclass(frozen=True)
@@ -408,7 +396,6 @@ class _PeakSearch:
     """A search of maps for peaks, one after the other, until none is left."""
 
     maps: Maps
-    fits: Sequence[Refinement]
     threshold: float
     inner: float
     scatter: float | None
@@ -421,7 +408,7 @@ class _PeakSearch:
         # sources within `inner`, each of which takes a pixel from the search.
         for _ in range(4 * _MAX_CANDIDATES + peaks.within.size + 1):
             snr, offsets = maps.snr(maps.without(peaks.candidates)), peaks.candidates.offsets
-            significance = significance_of(self.fits, maps, offsets, self.inner, self.scatter)
+            significance = significance_of(maps, offsets, self.inner, self.scatter)
             found = self._added(peaks, snr, significance)
             if found is None:
                 factor = significance.factor(snr, offsets)
@@ -454,7 +441,7 @@ class _PeakSearch:
             return None
         peak = significance.next_peak(snr, candidates.offsets, self.threshold, allowed)
         is_significant = peak is not None
-        if peak is None and count_rolls(self.fits) > 1:
+        if peak is None and count_rolls(self.maps.templates.fit) > 1:
             lowest = _HIDDEN_PEAK_THRESHOLD_RATIO * self.threshold
             peak = next(iter(significance.peaks(snr, candidates.offsets, lowest, allowed)), None)
         if peak is None:
@@ -506,11 +493,11 @@ class _PeakSearch:
         """Fit positions until they move no more, if the last fit ended before."""
         if candidates.converged:
             return candidates
-        return refine_candidates(self.maps.groups, candidates, reach=self._reach)
+        return refine_candidates(self.maps.templates, candidates, reach=self._reach)
 
     def _fitted(self, candidates: Candidates) -> Candidates:
         """All candidates fitted together, with their positions, by a few steps."""
-        return refine_candidates(self.maps.groups, candidates, self._reach, _POSITION_STEPS)
+        return refine_candidates(self.maps.templates, candidates, self._reach, _POSITION_STEPS)
 
     @property
     def _reach(self) -> float:

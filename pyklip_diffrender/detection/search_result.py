@@ -27,7 +27,7 @@ from pyklip_diffrender.detection.detection_file import (
     other_file,
     provenance_of,
     read_detection,
-    searched_fits,
+    searched_fit,
     write_astrometry,
     write_detection,
 )
@@ -47,7 +47,7 @@ from pyklip_diffrender.detection.measurement import (
     subtracted_frames,
 )
 from pyklip_diffrender.detection.published_limits import published_limits
-from pyklip_diffrender.detection.templates import Group
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.refinement import Refinement
@@ -112,11 +112,9 @@ class Detection:
 
     Attributes
     ----------
-    fits : tuple of Refinement
-        Fits that were searched, after the last refinement; empty if the detection was read from a
-        file without them.
-    groups : tuple of (LinearModel, Templates)
-        Linear model and templates of each fit of the target; empty without `fits`.
+    stored_fit : Refinement or None
+        The fit that was searched, after the last refinement; None if the detection was read from a
+        file without it. See `fit`.
     contrast : ndarray, (ny, nx)
         Flux of a point source at every pixel over the star's, before the coronagraph.
     error : ndarray, (ny, nx)
@@ -135,7 +133,7 @@ class Detection:
         they were found.
     false_alarm : ndarray, (candidates,)
         Probability that noise alone makes a peak as significant as the candidate anywhere in the
-        field; NaN where a fit does not explain its data.
+        field; NaN where the fit does not explain its data.
     rings : QTable
         Chi-squared per pixel, without the candidates, and error factor between separations.
     threshold : float
@@ -154,7 +152,7 @@ class Detection:
         stars, where that search is deeper at some separations.
     of_other : ndarray of bool, (ny, nx), or None
         Pixels whose maps, candidates and limits come from `other`, relative to the star of
-        `fits`.
+        `fit`.
 
     Examples
     --------
@@ -171,8 +169,7 @@ class Detection:
     0.50 arcsec
     """
 
-    fits: tuple[Refinement, ...]
-    groups: tuple[Group, ...]
+    stored_fit: Refinement | None
     contrast: Image
     error: Image
     photon_error: Image
@@ -209,7 +206,7 @@ class Detection:
     @cached_property
     def rolls(self) -> int:
         """Number of orientations of the target's frames that differ by more than a degree."""
-        return count_rolls(self.fits)
+        return count_rolls(self.fit)
 
     @property
     def _count(self) -> str:
@@ -232,9 +229,30 @@ class Detection:
         )  # fmt: skip
 
     @cached_property
+    def fit(self) -> Refinement:
+        """The fit that was searched, after the last refinement.
+
+        If the detection was read without it, ``fit.fits`` is read from the same folder.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If there is none, or none with its linear model.
+        """
+        if self.stored_fit is not None:
+            return self.stored_fit
+        assert self.path is not None  # Of a detection that was read.
+        return searched_fit(self.path, self._digest)
+
+    @cached_property
+    def templates(self) -> Templates:
+        """Images of planets in the frames of the fit."""
+        return Templates(self.fit)
+
+    @cached_property
     def observation(self) -> Observation:
         """The first frame; its integrations are averaged if the detection was read from a file."""
-        return self.fits[0].frames[0].observation
+        return self.fit.frames[0].observation
 
     @property
     def north(self) -> float:
@@ -249,7 +267,7 @@ class Detection:
     @cached_property
     def sky(self) -> Sky:
         """Orientation, epoch, and flux density of the star, as far as they are known."""
-        return Sky.of(self.fits, self.scatter)
+        return Sky.of(self.fit, self.scatter)
 
     @cached_property
     def candidates(self) -> QTable:
@@ -322,7 +340,7 @@ class Detection:
     @cached_property
     def _calibration_errors(self) -> Image:
         """Relative calibration errors of the candidates' contrasts and fluxes, (2, k)."""
-        return candidate_errors(self.groups, self.sources, self.error_factor)
+        return candidate_errors(self.templates, self.sources, self.error_factor)
 
     def measure(
         self,
@@ -378,13 +396,13 @@ class Detection:
 
     def _contrasts_at(self, offsets: ArrayLike) -> tuple[QTable, Image]:
         """Contrasts at positions, see `contrasts_at`, of the search that is deeper at each."""
-        raw, calibration = contrasts_at(self._searched[1], offsets, self.error_factor)
+        raw, calibration = contrasts_at(self.templates, offsets, self.error_factor)
         if self.other is None or self.of_other is None:
             return raw, calibration
         places = np.stack([raw["x"].value, raw["y"].value], axis=1)
         theirs, errors = self.other._contrasts_at(places)
         # Relative to the star of this search, as the map is.
-        one, two = (each._searched[0][0].frames[0].star_light for each in (self, self.other))
+        one, two = (each.fit.frames[0].star_light for each in (self, self.other))
         chosen = is_within(self.of_other, self.grid, places)
         for name, unit in (("contrast", two / one), ("contrast_error", two / one), ("snr", 1.0)):
             raw[name] = np.where(chosen, unit * theirs[name], raw[name])
@@ -406,39 +424,32 @@ class Detection:
         -------
         amplitude, error : float
         """
-        return measured_shape(*self._searched, image, self.scatter, relinearise)
+        return measured_shape(self.templates, image, self.scatter, relinearise)
 
     @cached_property
     def subtracted(self) -> tuple[Image, ...]:
-        """Star-subtracted frames of all fits, with the candidates as part of the model.
+        """Star-subtracted frames of the fit, with the candidates as part of the model.
 
         A fit without a companion in its model attributes some of its light to the star, so that
         `pyklip_diffrender.refinement.FrameFit.residual` has lost that light. Here the candidates
-        lose no light, only sources below the threshold do. Images (ny, nx) are in the order of
-        `fits`, in the data's unit, and NaN where the data are masked; frames of one observation are
-        averaged.
+        lose no light, only sources below the threshold do. Images (ny, nx) are in the order of the
+        fit's frames, in the data's unit, and NaN where the data are masked; integrations of a frame
+        are averaged.
         """
-        return subtracted_frames(self.fits, self.groups, self.sources)
+        return subtracted_frames(self.templates, self.sources)
 
     @cached_property
     def _wcs(self) -> tuple[Header, ...]:
         """World coordinates of the frames, in the order of `subtracted`."""
-        return tuple(f.wcs for fit in self.fits for f in fit.frames)
+        return tuple(each.wcs for each in self.fit.frames)
 
     @cached_property
-    def _searched(self) -> tuple[tuple[Refinement, ...], tuple[Group, ...]]:
-        """Fits and groups; if the detection was read without them, from the same folder."""
-        if self.path is None or self.groups:
-            return self.fits, self.groups
-        return searched_fits(self.path, self._digests)
-
-    @cached_property
-    def _digests(self) -> tuple[str, ...]:
-        return tuple(digest(fit) for fit in self.fits)
+    def _digest(self) -> str:
+        return digest(self.fit)
 
     @cached_property
     def provenance(self) -> dict[str, object]:
-        """Facts about the fits and the search, by name."""
+        """Facts about the fit and the search, by name."""
         return provenance_of(self)
 
     def plot(self, ax: Any = None) -> NDArray[Any]:
@@ -475,7 +486,7 @@ class Detection:
         - OFFSET_X, OFFSET_Y: position of every pixel from the star, arcsec;
         - SUBTRACTED, numbered by EXTVER: each frame without its star, candidates preserved;
         - DATA, ERROR, VALID: the first frame, its integrations averaged;
-        - FACTS: candidates, contrast curve, metadata and hashes of the fits, as JSON text, one byte
+        - FACTS: candidates, contrast curve, metadata and a hash of the fit, as JSON text, one byte
           a pixel.
 
         Parameters
@@ -527,7 +538,7 @@ class Detection:
         cls,
         path: str | os.PathLike[str],
         *,
-        fit: Refinement | Sequence[Refinement] | None = None,
+        fit: Refinement | None = None,
     ) -> Detection:
         """Read a detection that `write` wrote.
 
@@ -538,8 +549,8 @@ class Detection:
         ----------
         path : path
             The folder, or detection.fits in it.
-        fit : Refinement or sequence of Refinement, optional
-            The fits that were searched: the attribute `fits` of the detection that was written.
+        fit : Refinement, optional
+            The fit that was searched: the attribute `fit` of the detection that was written.
 
         Raises
         ------

@@ -1,9 +1,9 @@
-"""Images of planets of contrast 1 at any position in the frames of one fit, or of several."""
+"""Images of planets of contrast 1 at any position in the frames of a fit."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import rotation_matrix
-from pyklip_diffrender.linear.model import LinearModel, TemplateProducts
+from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -49,28 +49,35 @@ _SAME_PLACE = 1e-6
 class Templates:
     """Images of planets in frames that were refined together, in the data's unit.
 
-    Positions are x, y from the star in arcsec, in the frame `origin`. The others may be rolled and
-    have their stars at other positions. `frames` are the target's, by their place in the
-    fit.
+    Positions are x, y from the star in arcsec, in the frame `origin`, the first one. The others may
+    be rolled and have their stars at other positions. `frames` are the target's, by their place in
+    the fit, or those at `places` in it.
     """
 
-    def __init__(self, fit: Refinement, origin: FrameFit) -> None:
-        self.fit, self.origin = fit, origin
-        self.frames = {
-            k: frame for k, frame in enumerate(fit.frames) if not frame.observation.reference
-        }
-        if not self.frames or origin.observation.reference:
-            raise IncompatibleSetupError(
-                "detect: expected frames of the target, the first of all included; got a "
-                "reference star"
-            )
+    def __init__(self, fit: Refinement, places: Sequence[int] | None = None) -> None:
+        if places is None:
+            places = [k for k, each in enumerate(fit.frames) if not each.observation.reference]
+            if fit.frames[0].observation.reference:
+                raise IncompatibleSetupError(
+                    "fit: expected frames of the target, the first of all included; got a "
+                    "reference star"
+                )
+        self.fit = fit
+        self.frames = {k: fit.frames[k] for k in places}
+        self.origin = fit.frames[places[0]]
         self.rolls = {
-            k: frame.observation.roll_from(origin.observation) for k, frame in self.frames.items()
+            k: frame.observation.roll_from(self.origin.observation)
+            for k, frame in self.frames.items()
         }
         self._sources: dict[tuple[int, int, int], PointSources] = {}
         self._rendered: dict[tuple[float, ...], Tensor] = {}
-        self.grid = origin.grid
+        self.grid = self.origin.grid
         """x, y of all the first frame's pixels from the star, (ny, nx, 2), arcsec."""
+
+    @property
+    def linear(self) -> LinearModel:
+        """The linear model of the fit, without companions."""
+        return self.fit.star_only
 
     @staticmethod
     def _star(frame: FrameFit) -> Tensor:
@@ -233,37 +240,6 @@ def _few_wavelengths(model: OpticalSystem) -> Bandpass:
 
 def _as_tensor(opd: NDArray[np.float64]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(opd))
-
-
-# Fits of one target, each with its linear model and its templates.
-#
-# The frames of a fit share unknowns, frames of different fits do not. Therefore the information of
-# different groups adds.
-
-Group = tuple[LinearModel, Templates]
-
-
-def has_only_reference_stars(fit: Refinement) -> bool:
-    """Whether no frame of a fit shows the target."""
-    return all(frame.observation.reference for frame in fit.frames)
-
-
-def groups_of(fits: Sequence[Refinement]) -> list[Group]:
-    """Linear model and templates of every fit of the target."""
-    origin = fits[0].frames[0]
-    return [
-        (fit.star_only, Templates(fit, origin)) for fit in fits if not has_only_reference_stars(fit)
-    ]
-
-
-def weigh(
-    groups: Sequence[Group], render: Callable[[Templates], Mapping[int, Tensor]]
-) -> TemplateProducts:
-    """Inner products of the data with templates, (k, ny, nx) by frame, summed over groups."""
-    products = [linear.weigh(render(templates)) for linear, templates in groups]
-    return TemplateProducts(
-        *(torch.stack(parts).sum(dim=0) for parts in zip(*products, strict=True))
-    )
 
 
 # Frames of several rolls, turned to one orientation and averaged.

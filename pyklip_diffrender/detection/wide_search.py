@@ -288,7 +288,7 @@ def wide_field(detection: Detection, observations: Sequence[Observation]) -> Wid
     Parameters
     ----------
     detection : Detection
-        Search of one fit, whose frames are cutouts of the observations.
+        Search of a fit whose frames are cutouts of the observations.
     observations : sequence of Observation
         The target's frames before they were cut, in the order of the fit.
 
@@ -299,7 +299,7 @@ def wide_field(detection: Detection, observations: Sequence[Observation]) -> Wid
     Raises
     ------
     IncompatibleSetupError
-        For observations that were not fitted, or a detection of several fits.
+        For observations that were not fitted.
 
     Examples
     --------
@@ -324,16 +324,16 @@ def wide_field(detection: Detection, observations: Sequence[Observation]) -> Wid
     # The star's displacement is evaluated at half the height of the fitted frame.
     halfway = torch.tensor([0.0, float(np.abs(detection.grid[..., 1]).max()) / 2])
     found = [each.measurement for each in rows_of]
-    sources = with_position_of_star(detection.groups, _candidates(found), halfway.double())
+    sources = with_position_of_star(detection.templates, _candidates(found), halfway.double())
     numerator, _ = _products(frames, [each.residual for each in frames], grid)
     error = factor.of(grid) / np.sqrt(information)
     contrast = numerator / information
     for ours, theirs in ((contrast, detection.contrast), (error, detection.error)):
         ours[rows, columns] = theirs
     calibration = np.zeros((2, len(sources)))
-    star = detection.fits[0].frames[0]
+    star = detection.fit.frames[0]
     fitted = detection.scatter * float(star.errors["flux"][0]) / star.flux
-    calibration[0] = np.hypot(fitted, star_flux_error(detection.fits[0]))
+    calibration[0] = np.hypot(fitted, star_flux_error(detection.fit))
     table = candidate_table(sources, factor, calibration, detection.sky)
     # As in the table, the highest S/N first.
     order = np.argsort(-sources.snr(factor))
@@ -380,11 +380,7 @@ def require_outer_pixels(observation: Observation, size: int) -> None:
 
 
 def _frames(detection: Detection, observations: Sequence[Observation]) -> list[WholeFrame]:
-    if len(detection.fits) != 1:
-        raise IncompatibleSetupError(
-            f"detection: got one of {len(detection.fits)} fits, expected one of a single fit"
-        )
-    fitted = [each for each in detection.fits[0].frames if not each.observation.reference]
+    fitted = [each for each in detection.fit.frames if not each.observation.reference]
     names = [each.observation.name for each in fitted]
     if [each.name for each in observations] != names:
         raise IncompatibleSetupError(

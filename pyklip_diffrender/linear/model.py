@@ -17,9 +17,9 @@ then stands for J C^-1 J^T, with the derivatives J that are not whitened.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -291,6 +291,10 @@ class LinearModel:
         return (
             f"<LinearModel: {len(self.unknowns)} unknowns, {len(self.frames)} x {ny} x {nx} pixels>"
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Cached properties can be computed again, and are larger than the fields.
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
     def noise(self) -> Noise:

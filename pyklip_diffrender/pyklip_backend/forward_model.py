@@ -267,7 +267,7 @@ def planet_cards(
         with_position_of_star,
     )
     from pyklip_diffrender.detection.measurement import default_factor
-    from pyklip_diffrender.detection.templates import groups_of
+    from pyklip_diffrender.detection.templates import Templates
 
     # A companion of the fit within lambda/D is the planet itself: it makes room for one with the
     # place and flux of the forward model, the last of the sources, which are then fitted together.
@@ -277,25 +277,25 @@ def planet_cards(
     for k in reversed(range(len(others))):
         if np.hypot(*(others.offsets[k].numpy() - start)) < resolution:
             others = others.without(k)
-    groups = groups_of([part.result])
+    templates = Templates(part.result)
     sources = refine_candidates(
-        groups, others.with_one_more(start, planet.contrast), resolution / 2
+        templates, others.with_one_more(start, planet.contrast), resolution / 2
     )
     moved = sources.offsets[-1].numpy() - start
     flux = float(sources.contrasts[-1]) / planet.contrast
     if not (np.hypot(*moved) < resolution and flux > 0):
         _log.info("no source within lambda/D of the planet of the forward model")
         return cards
-    sources = with_position_of_star(groups, sources)
+    sources = with_position_of_star(templates, sources)
     # Rows and columns are contrasts, then x, then y, of all sources: of the last these are 3 x 3.
     covariance = sources.covariance.numpy().reshape(3, len(sources), 3, len(sources))[:, -1, :, -1]
     if error_factor is None:
-        error_factor = default_factor([part.result], groups, sources)
+        error_factor = default_factor(templates, sources)
     factor = float(error_factor.of(sources.offsets[-1:])[0])
     error = factor * np.sqrt(covariance[0, 0])
     snr = sources.contrasts.new_tensor(sources.snr(error_factor)[-1:])
     factors = snr.new_full(snr.shape, factor)
-    calibration = float(calibration_errors(groups, sources.offsets[-1:], snr, factors)[1, 0])
+    calibration = float(calibration_errors(templates, sources.offsets[-1:], snr, factors)[1, 0])
     detector = part.frame.model.detector
     # From arcsec along x and y to pixels, then as pyKLIP turns the frames; east is to the left.
     pixels = np.linalg.inv([[1.0, 0.0], [detector.shear, 1.0]])

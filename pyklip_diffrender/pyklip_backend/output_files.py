@@ -69,7 +69,6 @@ class ProductImages:
 
     def __init__(self, subtraction: Subtraction) -> None:
         self.pointings = subtraction.pointings
-        self.fits = list(dict.fromkeys(part.result for part in self.pointings))
         self._disk = None if subtraction.reduction is None else subtraction.reduction.disk
 
     @cached_property
@@ -78,7 +77,8 @@ class ProductImages:
         # Takes a second to import.
         from pyklip_diffrender.imaging import SkyModel
 
-        return SkyModel(self.fits)
+        # All pointings were fitted together.
+        return SkyModel(self.pointings[0].result)
 
     def _peaks(self, templates: Templates) -> Image:
         """Peaks of planets of contrast 1 at the pixels of the first frame, (ny, nx)."""
@@ -101,11 +101,8 @@ class ProductImages:
         disk = self._disk
         if disk is None or not len(disk.offsets):
             return None
-        # Takes a second to import.
-        from pyklip_diffrender.detection.templates import groups_of
-
-        _, templates = groups_of(self.fits)[0]
-        angle = self.fits[0].frames[0].observation.position_angle
+        templates = self.sky.templates
+        angle = templates.origin.observation.position_angle
         # A point of the disk of contrast c has c times the peak of a planet of contrast 1 at the
         # nearest pixel; the estimate of the sky makes its image from that peak.
         away = disk.offsets[:, None] - templates.grid.reshape(-1, 2)
@@ -121,30 +118,28 @@ class ProductImages:
         """
         sky = self._cleaned(added)
         for part in self.pointings:
-            in_frame = self.sky.in_frame(sky, self.fits.index(part.result), part.index)
+            in_frame = self.sky.in_frame(sky, part.index)
             pasted = part.paste(in_frame, part.window)
             frames = residuals[part.pointing.frames]
             # Pixels without a value have none in the image either.
             shown = np.isfinite(pasted) & np.isfinite(frames)
             residuals[part.pointing.frames] = np.where(shown, pasted, frames)
 
-    def _added(self, added: Image) -> list[dict[int, Tensor]]:
-        """Light in copies of the frames by frame of each fit, (1, ny, nx)."""
-        light: list[dict[int, Tensor]] = [{} for _ in self.fits]
+    def _added(self, added: Image) -> dict[int, Tensor]:
+        """Light in copies of the frames, (1, ny, nx) by frame of the fit."""
+        light = {}
         for part in self.pointings:
-            group, k = self.fits.index(part.result), part.index
             image = torch.from_numpy(part.mean_light(added))
-            known = part.result.linear.frames[k].weight > 0
-            light[group][k] = torch.where(known, image, 0.0)[None]
+            known = part.result.linear.frames[part.index].weight > 0
+            light[part.index] = torch.where(known, image, 0.0)[None]
         return light
 
     def _cleaned(self, added: Image | None) -> Image:
         """Posterior mean of the sky, north up."""
-        light: list[dict[int, Tensor]] = [dict(each) for each in self.sky.light()]
+        light = dict(self.sky.light())
         if added is not None:
-            for images, more in zip(light, self._added(added), strict=True):
-                for k, image in more.items():
-                    images[k] = images[k] + image
+            for k, image in self._added(added).items():
+                light[k] = light[k] + image
         rest = np.asarray(self.sky.estimate(light)[0])
         return rest if self._extended is None else rest + self._extended
 
@@ -191,7 +186,7 @@ def throughput_map(
     """
     from pyklip_diffrender.detection.templates import Templates
 
-    templates = Templates(fit, fit.frames[0])
+    templates = Templates(fit)
     ny, nx = fit.frames[0].model.detector.shape
     rows, columns = (np.unique(np.append(np.arange(0, n, spacing), n - 1)) for n in (ny, nx))
     y, x = np.meshgrid(rows, columns, indexing="ij")

@@ -130,13 +130,13 @@ def _give_back(
     from pyklip_diffrender.detection.candidates import are_companions
 
     candidates = detection.sources
-    for k in np.flatnonzero(are_companions(detection.fits[0], candidates))[::-1]:
+    for k in np.flatnonzero(are_companions(detection.fit, candidates))[::-1]:
         candidates = candidates.without(int(k))
     if not len(candidates):
         return
     # The star has taken J H^-1 G (their light); those that are companions of the fit, none.
-    _, templates = detection.groups[0]
-    change = fitted[0].result.linear.response(candidates.light(templates))[:, 0]
+    light = candidates.light(detection.templates)
+    change = fitted[0].result.linear.response(light)[:, 0]
     for part in fitted:
         star[part.pointing.frames] -= part.change_in_frames(change)
 

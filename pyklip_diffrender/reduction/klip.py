@@ -130,8 +130,7 @@ def klip_curve(
     from 2 lambda/D to the edge. Raises IncompatibleSetupError if a roll has no references, or no
     separation is in the frames.
     """
-    templates = Templates(detection.fits[0], detection.fits[0].frames[0])
-    resolution = detection.contrast_curve.meta["resolution_arcsec"]
+    templates, resolution = detection.templates, detection.contrast_curve.meta["resolution_arcsec"]
     # The light of all candidates is subtracted first, whether the fit has them as companions or
     # only the search found them: they are noise of neither method.
     klip = KlipSubtraction(templates, references, resolution, candidates=detection.sources)
@@ -216,9 +215,8 @@ def klip_image(
     and a label. `science` takes the place of the fit's frames, from which a disk may have been
     subtracted.
     """
-    templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    klip = KlipSubtraction(templates, references, resolution, science)
+    klip = KlipSubtraction(detection.templates, references, resolution, science)
     used = min(modes, len(klip.modes))
     image = klip.residuals(klip.science, north)[used - 1]
     shown = np.where(klip._zone, image, np.nan)

@@ -47,7 +47,7 @@ class SkyImages:
     def __init__(self, reduction: ReductionResult) -> None:
         self.detection: Detection = reduction.detection
         self._disk, self._is_quick = reduction.disk, reduction.accuracy == "quick"
-        self._templates = self.detection.groups[0][1]
+        self._templates = self.detection.templates
         observation = self.detection.observation
         self.oriented = observation.position_angles is not None
         self._half = max(observation.shape) // 2
@@ -73,7 +73,7 @@ class SkyImages:
 
     @cached_property
     def _sky_model(self) -> SkyModel:
-        return SkyModel(self.detection.fits)
+        return SkyModel(self.detection.fit)
 
     @cached_property
     def posterior_mean(self) -> Image:
@@ -279,7 +279,7 @@ class ReportPictures:
         """Draw all that a reduction has."""
         detection = reduction.detection
         klip = overview.klip and overview.klip.curve
-        frames = list(detection.groups[0][1].frames)[:MOST_FRAMES]
+        frames = list(detection.templates.frames)[:MOST_FRAMES]
         shown = range(min(len(detection.candidates), MOST_FRAMES))
         planets, fractions = reduction.injections, reduction.completeness
         return cls(
@@ -379,7 +379,7 @@ def _source_of(detection: Detection, place: int) -> int:
 
 def _stamps(detection: Detection, place: int) -> dict[int, drawing.Stamp]:
     """The pixels about a candidate in the first frames that show some, by their number from 1."""
-    templates, sources = detection.groups[0][1], detection.sources
+    templates, sources = detection.templates, detection.sources
     index = _source_of(detection, place)
     offset = sources.offsets[index : index + 1]
     light, together = templates.at(offset), sources.light(templates)
@@ -481,7 +481,7 @@ def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
 def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
     """Data, model and residual of a frame."""
     detection = reduction.detection
-    observation = detection.fits[0].frames[frame].observation
+    observation = detection.fit.frames[frame].observation
     unit, count = drawing.unit_label(observation.unit), observation.count
     subtracted = (
         " The star was estimated together with the candidates (circles), whose light is kept."
@@ -529,7 +529,7 @@ def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[P
 
 def _of_frame(detection: Detection, frame: int) -> list[Any]:
     """Draw a frame, the model of its star, and the residual, in which candidates are kept."""
-    fit = detection.fits[0]
+    fit = detection.fit
     part, observation = fit.frames[frame], fit.frames[frame].observation.combined()
     valid, noise = observation.valid[0], observation.error[0]
     data = np.where(valid, observation.data[0], np.nan)

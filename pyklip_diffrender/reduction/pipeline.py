@@ -354,7 +354,7 @@ class _Run:
             assert detection is not None
             return ReductionResult(
                 sequence,
-                detection.fits[0],
+                detection.fit,
                 detection,
                 choice.references,
                 choice.pattern,
@@ -397,7 +397,7 @@ class _Run:
             keep()
             with stage("completeness"):
                 fractions = completeness(detection, progress=self.progress)
-        self._require_plausible(detection.fits[0])  # It may have been fitted with companions.
+        self._require_plausible(detection.fit)  # It may have been fitted with companions.
         return reduction()
 
     def _whole_frames(

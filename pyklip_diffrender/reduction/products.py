@@ -241,7 +241,7 @@ def write_products(
         path = folder / "fit.fits"
         written.append(reduction.fit.write(path, linear=derivatives, overwrite=True))
         if reduction.detection.other is not None:
-            other, path = reduction.detection.other.fits[0], folder / "fit_other.fits"
+            other, path = reduction.detection.other.fit, folder / "fit_other.fits"
             written.append(other.write(path, linear=derivatives, overwrite=True))
     if reduction.wide is not None:
         written += reduction.wide.write(folder, overwrite=True)

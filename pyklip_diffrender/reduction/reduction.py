@@ -221,7 +221,7 @@ class Reduction(ReductionResult):
         IncompatibleSetupError
             For a reduction that was read without derivatives.
         """
-        if not self.detection.groups:
+        if self.detection.stored_fit is None:
             raise IncompatibleSetupError(
                 f"{self.sequence.target}: the reduction was read from a folder without the "
                 "derivatives of the images, which its figures need. Copy that folder, or write the "

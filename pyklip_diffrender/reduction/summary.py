@@ -187,7 +187,7 @@ def _star(detection: Detection) -> dict[str, Any] | None:
     if detection.sky.star is None:
         return None
     value, error = detection.sky.star
-    known = detection.fits[0].catalogue_flux is not None
+    known = detection.fit.catalogue_flux is not None
     return {
         "flux_density_Jy": value,
         "flux_density_error_Jy": error,

@@ -41,7 +41,7 @@ from pyklip_diffrender.detection import (
     stated_limits,
 )
 from pyklip_diffrender.detection.field import ring_pixels
-from pyklip_diffrender.detection.templates import groups_of, weigh
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
@@ -524,11 +524,11 @@ def _gain(alone: Refinement, joint: Refinement) -> float:
 
 def _light_errors(fit: Refinement) -> NDArray[np.float64]:
     """Errors of the light of point sources, medians of the positions at each separation."""
-    groups, edge = groups_of([fit]), float(np.abs(fit.frames[0].grid).max())
+    templates, edge = Templates(fit), float(np.abs(fit.frames[0].grid).max())
     separations = [each for each in _SEPARATIONS if each < edge] or [edge / 2]
-    rings = ring_pixels(groups[0][1].grid, np.array(separations), _POSITIONS_PER_SEPARATION)
+    rings = ring_pixels(templates.grid, np.array(separations), _POSITIONS_PER_SEPARATION)
     rows, columns = np.concatenate(rings, axis=1)
-    products = weigh(groups, lambda templates: templates.at_pixels(rows, columns))
+    products = templates.linear.weigh(templates.at_pixels(rows, columns))
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
     errors = np.split(products.information.numpy() ** -0.5, ends)
     return fit.frames[0].star_light * np.array([np.median(each) for each in errors if len(each)])

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
@@ -486,6 +486,10 @@ class Refinement:
             f"<Refinement: {self.status.name}, {count} frame{'s' if count > 1 else ''}, "
             f"chi2/pixel {self.chi2_per_pixel:.3g}, {self.seconds:.1f} s>"
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Without what is cached, which can be computed again and is larger than the rest.
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def _repr_html_(self) -> str:
         return html_summary(

@@ -302,7 +302,7 @@ def _reduced(
     write_snr(folder / f"{prefix}-snr.fits", detection, product)
     write_contrast(product, detection)
     detection.write(folder / prefix, overwrite=True)
-    detection.fits[0].write(folder / prefix / "fit.fits", overwrite=True)
+    detection.fit.write(folder / prefix / "fit.fits", overwrite=True)
     source_table(detection, product).write(
         folder / f"{prefix}-results.ecsv", format="ascii.ecsv", overwrite=True
     )
