@@ -23,6 +23,7 @@ from pyklip_diffrender.linear.model import LinearFrame
 from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement import FrameFit, Refinement, refine_again, star_flux_error
+from pyklip_diffrender.refinement.settings import SAME_ROLL_DEG
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 
@@ -607,9 +608,6 @@ _REFERENCE_SOURCE_SNR = 6.0
 _REFERENCE_PEAK_SNR = 4.5
 """Approximate S/N, in units of its scatter, above which a peak is looked at more closely."""
 
-_SAME_ROLL_DEG = 1.0
-"""Degrees between frames whose sources are at the same pixels."""
-
 _INNER_ARCSEC = 0.3
 """Smallest separation, arcsec. Nearer to the star, a source is taken up by the wavefront."""
 
@@ -696,7 +694,7 @@ def _approximate_snr(
     weight = torch.zeros_like(cleaned)
     for k in places:
         roll = fit.frames[k].observation.roll_from(fit.frames[first].observation)
-        if abs(roll) < _SAME_ROLL_DEG:
+        if abs(roll) < SAME_ROLL_DEG:
             scale = fit.frames[k].flux / fit.frames[first].flux
             cleaned += scale * linear.frames[k].weight * linear.cleaned[k]
             weight += (scale * linear.frames[k].weight) ** 2

@@ -22,7 +22,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image, is_within, separation_of
 from pyklip_diffrender.detection.search_result import Detection
 
-_SAME_SOURCE_LAMBDA_D = 0.5
+SAME_SOURCE_LAMBDA_D = 0.5
 """Largest distance of two searches' candidates that are one source. The searches share the target's
 frames, so that their positions of a source differ by less than the error of either, a tenth of
 lambda/D at S/N 5."""
@@ -107,7 +107,7 @@ def _joined_sources(
     away = np.hypot(*np.moveaxis(places[0][:, None] - places[1][None], -1, 0))
     in_second = is_within(region, first.grid, places[0])
     kept = [~in_second, is_within(region, first.grid, places[1])]
-    for k, j in zip(*np.nonzero(away < _SAME_SOURCE_LAMBDA_D * resolution), strict=True):
+    for k, j in zip(*np.nonzero(away < SAME_SOURCE_LAMBDA_D * resolution), strict=True):
         kept[0][k], kept[1][j] = not in_second[k], bool(in_second[k])
     parts = [np.flatnonzero(each) for each in kept]
     count, one = sum(map(len, parts)), len(parts[0])

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Maps
+from pyklip_diffrender.detection.deeper import SAME_SOURCE_LAMBDA_D
 from pyklip_diffrender.detection.error_factor import Significance
 from pyklip_diffrender.detection.field import (
     Image,
@@ -54,11 +55,11 @@ CLEAR = 0.3
 _GOLDEN_ANGLE_DEG = 137.5
 """Degrees between neighbours in separation."""
 
+_PLACES_ON_CIRCLE = 36
+"""Number of places at a separation, one of which is to be free."""
+
 _NEXT_SET_ANGLE_DEG = 47.0
 """Degrees between planets at the same separation, one set and the next."""
-
-_FREE_PLACE_STEP_DEG = 10.0
-"""Degrees by which a planet is moved on until its place is free."""
 
 
 class MeasuredPlanet(NamedTuple):
@@ -186,18 +187,16 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
 
     The first such place counter-clockwise from the angle; if there is none, the place at the angle.
     """
-    table = detection.candidates
-    candidates = np.stack([table["x"].value, table["y"].value], axis=-1)
-    turns = np.arange(0, 360, _FREE_PLACE_STEP_DEG).tolist()
-    circle: list[NDArray[np.float64]] = [
-        np.array(Planet(1.0, separation, angle + turn).offset) for turn in turns
-    ]
-    for place in circle:
-        away = np.hypot(*np.moveaxis(detection.grid - place, -1, 0))
-        nearest = np.unravel_index(away.argmin(), away.shape)
-        if detection.has_limits[nearest] and (np.hypot(*(candidates - place).T) > CLEAR).all():
-            return place
-    return circle[0]
+    places = _free_places(detection, separation, _PLACES_ON_CIRCLE, angle)
+    return places[0] if len(places) else np.array(Planet(1.0, separation, angle).offset)
+
+
+def _free_places(detection: Detection, separation: float, count: int, start: float) -> Image:
+    """x, y of places at a separation, evenly spread from an angle on, that are free."""
+    free = detection.has_limits & far_from(detection.grid, detection.sources.offsets, CLEAR)
+    angles = np.radians(start) + 2 * np.pi * np.arange(count) / count
+    places = separation * np.stack([-np.sin(angles), np.cos(angles)], axis=-1)
+    return places[is_within(free, detection.grid, places)]
 
 
 # Fraction of planets that a search finds, by contrast and separation.
@@ -212,9 +211,6 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
 _PLANETS_OVER_LIMIT = tuple(np.geomspace(0.4, 3.0, 12).tolist())
 """Contrasts over the limit with the small-sample correction."""
 
-
-_SAME_LAMBDA_D = 0.5
-"""Largest distance of a candidate from the planet that it stands for, lambda/D."""
 
 _PLANETS_AT_A_TIME = 64
 """Number of planets whose maps are computed at a time."""
@@ -285,13 +281,12 @@ def completeness(
     searches = [_Searched.of(detection, inner, progress)]
     if detection.other is not None:
         searches.append(_Searched.of(detection.other, inner, progress))
-    grid, known = detection.grid, detection.sources
+    grid = detection.grid
     curve = detection.contrast_curve
     limit_at, limits = curve["separation"].value, np.asarray(curve["small_sample"])
     chosen = limit_at[1::2] if separations is None else curve_separations(grid, separations)
-    free = detection.has_limits & far_from(grid, known.offsets, CLEAR)
     places = [
-        _free_places(grid, free, separation, angles, _GOLDEN_ANGLE_DEG * n)
+        _free_places(detection, separation, angles, _GOLDEN_ANGLE_DEG * n)
         for n, separation in enumerate(chosen)
     ]
     count = sum(map(len, places)) * len(strengths)
@@ -369,19 +364,6 @@ def contrast_of_completeness(table: QTable, fraction: float) -> QTable:
     return curve
 
 
-def _free_places(
-    grid: Image, free: NDArray[np.bool_], separation: float, count: int, start: float
-) -> Image:
-    """x, y of planets at a separation, evenly spread from an angle on, where pixels are free."""
-    angles = np.radians(start) + 2 * np.pi * np.arange(count) / count
-    places = separation * np.stack([-np.sin(angles), np.cos(angles)], axis=-1)
-    kept = []
-    for place in places:
-        away = np.hypot(*np.moveaxis(grid - place, -1, 0))
-        kept.append(bool(free[np.unravel_index(away.argmin(), away.shape)]))
-    return places[kept]
-
-
 @dataclass(frozen=True)
 class _Searched:
     """The maps of a search, without its candidates, to which planets are added."""
@@ -424,5 +406,5 @@ class _Searched:
         snr = self.maps.snr(self.residual + change)
         everywhere = np.ones(snr.shape, dtype=bool)
         peaks = self.significance.significant_peaks(snr, self.sources, self.threshold, everywhere)
-        reach, grid = _SAME_LAMBDA_D * self.significance.resolution, self.significance.grid
+        reach, grid = SAME_SOURCE_LAMBDA_D * self.significance.resolution, self.significance.grid
         return any(np.hypot(*(grid[peak] - place)) < reach for peak, _ in peaks)

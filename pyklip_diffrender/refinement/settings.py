@@ -518,8 +518,9 @@ _WRONG_PRIOR_SCALE_RATIO = 1.5
 _SAME_SEQUENCE_DAYS = 2.0 / 24
 """Days between the beginnings of frames of one exposure sequence: nine dithers of a faint star."""
 
-_SAME_ROLL_DEG = 1.0
-"""Degrees by which the roll may differ within an exposure sequence."""
+SAME_ROLL_DEG = 1.0
+"""Degrees by which the roll may differ within an exposure sequence, whose sources are at the same
+pixels."""
 
 
 def exposure_sequences(observations: Sequence[Observation]) -> list[int]:
@@ -546,7 +547,7 @@ def _follows(one: Observation, other: Observation) -> bool:
     angle, other_angle = one.position_angles, other.position_angles
     if angle is None or other_angle is None:
         return True
-    return abs(half_circle(float(angle[0] - other_angle[0]))) <= _SAME_ROLL_DEG
+    return abs(half_circle(float(angle[0] - other_angle[0]))) <= SAME_ROLL_DEG
 
 
 def count_modes_below(basis: Basis, cycles: float) -> int:
