@@ -2,11 +2,10 @@
 
 from pyklip_diffrender.demo.comparison import (
     DITHERS,
-    DemoResult,
     draw_demo,
     run_demo,
     simulate_references,
     write_demo,
 )
 
-__all__ = ["DITHERS", "DemoResult", "draw_demo", "run_demo", "simulate_references", "write_demo"]
+__all__ = ["DITHERS", "draw_demo", "run_demo", "simulate_references", "write_demo"]

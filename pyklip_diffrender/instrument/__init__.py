@@ -7,7 +7,6 @@ from pyklip_diffrender.instrument.jwst import (
     is_jwst_pupil,
     jwst_pupil,
     jwst_segments,
-    maskbar_openings,
     maskrnd_openings,
 )
 from pyklip_diffrender.instrument.masks import (
@@ -26,8 +25,6 @@ from pyklip_diffrender.instrument.nircam import (
     nircam_coronagraph,
 )
 from pyklip_diffrender.instrument.spectrum import (
-    PlanetSpectra,
-    blackbody,
     filter_bandpass,
     filter_throughput,
     planet_spectra,
@@ -42,8 +39,6 @@ __all__ = [
     "TABULATED_GAP",
     "BarMask",
     "ChromaticAberration",
-    "PlanetSpectra",
-    "blackbody",
     "detector_place",
     "filter_bandpass",
     "filter_shift",
@@ -53,7 +48,6 @@ __all__ = [
     "is_short_wave",
     "jwst_pupil",
     "jwst_segments",
-    "maskbar_openings",
     "maskrnd_openings",
     "nircam_coronagraph",
     "planet_spectra",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.optics.fast_path import finest_spacing
 from pyklip_diffrender.optics.grid import (
     JWST_DIAMETER,
     PupilGrid,
@@ -11,23 +10,17 @@ from pyklip_diffrender.optics.grid import (
     resample,
     transform_polygons,
     widen_polygon,
-    zernike_basis,
 )
 from pyklip_diffrender.optics.planes import (
-    Cache,
     ChainDetector,
     Detector,
-    Effect,
-    EntrancePupil,
     GaussianBlur,
     LinearResampling,
     LyotStop,
     MatrixFourier,
     PixelCrosstalk,
     Plane,
-    Position,
     Wavefront,
-    kernel,
 )
 from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.optics.system import InstrumentSystem, OpticalSystem
@@ -35,11 +28,8 @@ from pyklip_diffrender.optics.system import InstrumentSystem, OpticalSystem
 __all__ = [
     "JWST_DIAMETER",
     "Bandpass",
-    "Cache",
     "ChainDetector",
     "Detector",
-    "Effect",
-    "EntrancePupil",
     "GaussianBlur",
     "InstrumentSystem",
     "LinearResampling",
@@ -49,14 +39,10 @@ __all__ = [
     "PixelCrosstalk",
     "Plane",
     "PointSources",
-    "Position",
     "PupilGrid",
     "Wavefront",
-    "finest_spacing",
-    "kernel",
     "polygon_coverage",
     "resample",
     "transform_polygons",
     "widen_polygon",
-    "zernike_basis",
 ]

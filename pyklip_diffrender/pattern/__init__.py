@@ -8,7 +8,6 @@ from __future__ import annotations
 from pyklip_diffrender.pattern.choice import (
     PatternChoice,
     PatternRequest,
-    ReferenceFrames,
     as_request,
     choose_pattern,
     fit_with_pattern,
@@ -27,10 +26,8 @@ from pyklip_diffrender.pattern.library import (
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
-    lacks_pattern,
     learn_pattern,
     measure_patterns,
-    pattern_pedestal,
     pattern_size,
 )
 
@@ -39,7 +36,6 @@ __all__ = [
     "PatternChoice",
     "PatternLibrary",
     "PatternRequest",
-    "ReferenceFrames",
     "as_request",
     "choose_pattern",
     "combine_libraries",
@@ -47,13 +43,11 @@ __all__ = [
     "fit_with_pattern",
     "is_known_beside",
     "known_pattern",
-    "lacks_pattern",
     "learn_pattern",
     "learn_patterns",
     "measure_patterns",
     "package_library",
     "pattern_for_visit",
-    "pattern_pedestal",
     "pattern_size",
     "place_on_detector",
     "with_known_pattern",

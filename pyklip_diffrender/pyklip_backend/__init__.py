@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.dataset_frames import observation_from_dataset
-from pyklip_diffrender.pyklip_backend.fitted_star import Fit, Subtraction, Subtractor
+from pyklip_diffrender.pyklip_backend.fitted_star import Fit, Subtraction
 from pyklip_diffrender.pyklip_backend.registration import (
-    ALGORITHM,
     backend,
     is_registered,
     register,
@@ -18,11 +17,9 @@ from pyklip_diffrender.pyklip_backend.registration import (
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 
 __all__ = [
-    "ALGORITHM",
     "DiffrenderSettings",
     "Fit",
     "Subtraction",
-    "Subtractor",
     "backend",
     "is_registered",
     "observation_from_dataset",

@@ -5,7 +5,6 @@ from pyklip_diffrender.reduction.pipeline import Preparation, ReductionResult, p
 from pyklip_diffrender.reduction.products import (
     PRODUCTS,
     ProductFolder,
-    existing_products,
     write_products,
 )
 from pyklip_diffrender.reduction.reduction import Reduction, reduce
@@ -19,13 +18,12 @@ from pyklip_diffrender.reduction.several import (
     write_comparison,
 )
 from pyklip_diffrender.reduction.summary import summarise
-from pyklip_diffrender.reduction.visit import Contribution, Visit
+from pyklip_diffrender.reduction.visit import Visit
 
 __all__ = [
     "COMPARISON",
     "PRODUCTS",
     "SPECTRA",
-    "Contribution",
     "Preparation",
     "ProductFolder",
     "ReduceOptions",
@@ -34,7 +32,6 @@ __all__ = [
     "Visit",
     "by_star",
     "combined_rows",
-    "existing_products",
     "in_words",
     "prepare",
     "reduce",

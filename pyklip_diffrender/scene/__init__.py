@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.integrations import calibrated_errors
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.objects import (
     ALPHA_PICTORIS_W2,
-    PAPER_SEGMENT_GAP,
     UNOCCULTED_PEAK,
     Planet,
     Scene,
@@ -27,8 +24,6 @@ from pyklip_diffrender.scene.simulation import (
 
 __all__ = [
     "ALPHA_PICTORIS_W2",
-    "BAD_PIXEL_BITS",
-    "PAPER_SEGMENT_GAP",
     "UNOCCULTED_PEAK",
     "DetectorPattern",
     "ExposureSequence",
@@ -40,7 +35,6 @@ __all__ = [
     "expected_photons",
     "model_for",
     "planet_photons",
-    "shift_frames",
     "simulate",
     "star_photons",
     "world_coordinates",

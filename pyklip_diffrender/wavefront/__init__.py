@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from pyklip_diffrender.wavefront.bases import (
-    Basis,
     FourierModes,
     JointBasis,
     SegmentMotions,
     default_basis,
 )
 from pyklip_diffrender.wavefront.opd import (
-    RULES,
     as_opd_map,
     choose_opd,
     opd_for,
@@ -23,8 +21,6 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior, solv
 from pyklip_diffrender.wavefront.wss import interpolate_wss
 
 __all__ = [
-    "RULES",
-    "Basis",
     "FourierModes",
     "JointBasis",
     "OPDMap",
