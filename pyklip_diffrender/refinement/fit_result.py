@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 from astropy.io import fits
-from astropy.nddata import CCDData
 from astropy.table import QTable
 from astropy.time import Time
 from numpy.typing import NDArray
@@ -48,7 +47,7 @@ from pyklip_diffrender.refinement.unknowns import brightest
 from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.product_headers import ccd_data, primary_hdu, world_coordinates
+from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
@@ -223,17 +222,6 @@ class FrameFit:
     def wcs(self) -> fits.Header:
         """World coordinates of the pixels, see `world_coordinates`."""
         return world_coordinates(self.grid, self.observation)
-
-    def to_ccddata(self) -> CCDData:
-        """The frame without its star as astropy's `CCDData`; integrations are averaged.
-
-        The image has the world coordinates, the mask and the errors of the frame; see `residual`.
-        """
-        frame = self.observation.combined()
-        data = frame.data[0] - self.star
-        return ccd_data(
-            data, frame.error[0], frame.unit, self.wcs, frame.valid[0], frame=frame.name
-        )
 
     def render(
         self,

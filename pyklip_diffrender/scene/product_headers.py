@@ -6,10 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from astropy import units as u
 from astropy.io import fits
-from astropy.nddata import CCDData, StdDevUncertainty
-from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from pyklip_diffrender.io.headers import fits_text, known_number, known_text, set_keyword
@@ -100,28 +97,3 @@ def world_coordinates(grid: NDArray[np.float64], observation: Observation) -> fi
     if unit == "deg":
         header["RADESYS"] = known_text(observation.header, "RADESYS") or "ICRS"
     return header
-
-
-def ccd_data(
-    image: NDArray[np.float64],
-    error: NDArray[np.float64] | None,
-    unit: u.UnitBase,
-    wcs: fits.Header,
-    valid: NDArray[np.bool_] | None = None,
-    /,
-    **meta: Any,
-) -> CCDData:
-    """Make astropy's `CCDData` of an image, (ny, nx), masked where it is not valid or not finite.
-
-    `error` are standard deviations, (ny, nx); `meta` are entries of the attribute of that name.
-    """
-    mask = ~np.isfinite(image)
-    uncertainty = None
-    if error is not None:
-        mask |= ~np.isfinite(error)
-        uncertainty = StdDevUncertainty(np.array(error))
-    if valid is not None:
-        mask |= ~valid
-    return CCDData(
-        np.array(image), unit=unit, mask=mask, uncertainty=uncertainty, wcs=WCS(wcs), meta=meta
-    )
