@@ -365,7 +365,7 @@ def reduced(monkeypatch):
     """Stub for the fits and searches."""
     made = Reduced()
 
-    def stub(given, *, progress, products):
+    def stub(given, *, progress, keep):
         print("a library says hello")
         if isinstance(made.error, errors.RefinementError):
             for _ in range(2):
@@ -377,7 +377,7 @@ def reduced(monkeypatch):
             assert meanwhile() == 0
         made.append(StubReduction(given, progress, made.writes))
         if made.interrupted:
-            products.keep(made[-1])
+            keep(made[-1])
             raise KeyboardInterrupt
         return made[-1]
 

@@ -63,7 +63,7 @@ def stopped(tmp_path_factory):
         patch.setattr(pipeline, "recover_planets", interrupted)
         patch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"no picture")
         with pytest.raises(KeyboardInterrupt):
-            preparation().run(products=products)
+            preparation().run(keep=products.keep)
     (reduction,) = products.kept
     return reduction, products.folder
 

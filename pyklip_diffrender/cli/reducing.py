@@ -161,7 +161,7 @@ def _clear(earlier: Iterable[ProductFolder], used: Collection[Path]) -> None:
 def _reduced(preparation: Preparation, products: ProductFolder, *, progress: bool) -> Any:
     """Reduce a sequence, write its products and say what they show; returns the summary."""
     with numbered_stages():
-        reduction = preparation.run(progress=progress, products=products)
+        reduction = preparation.run(progress=progress, keep=products.keep)
         with stage("products"):
             files = products.keep(reduction)
     click.echo(f"wrote {products.folder / 'report.html'} and {len(files) - 1} more files")

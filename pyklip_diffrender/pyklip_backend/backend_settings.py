@@ -97,8 +97,11 @@ class DiffrenderSettings:
     (see the options)
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
-    subtractor : Subtractor, optional
-        Function that renders the star; `subtract_by_refinement` by default.
+    subtractor : callable, optional
+        Function of an `Observation`, an `OPDMap` and these settings that returns a `Subtraction`;
+        `subtract_by_refinement` by default. It runs in the main process and gets frames that have
+        at least one valid pixel. A DiffrenderError stops the reduction, which then leaves no
+        products.
 
     Raises
     ------

@@ -6,7 +6,7 @@ import dataclasses
 import logging
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.source_frames import Pointing
 from pyklip_diffrender.scene.aligned_frames import shift_frames
-from pyklip_diffrender.scene.observation import Observation, Window
+from pyklip_diffrender.scene.observation import Window
 from pyklip_diffrender.scene.simulation import field_of
-from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.reduction.pipeline import ReductionResult
@@ -222,21 +220,6 @@ class Subtraction:
     def worst(self) -> Fit:
         """The fit with the largest chi2."""
         return max(self.fits, key=lambda fit: fit.chi2)
-
-
-class Subtractor(Protocol):
-    """A function that renders the star in frames; it runs in the main process."""
-
-    def __call__(
-        self, observation: Observation, opd: OPDMap, settings: DiffrenderSettings
-    ) -> Subtraction:
-        """Fit the star in n frames, each with at least one valid pixel.
-
-        The fit starts from `opd`. A
-        DiffrenderError, if there is no usable result, stops the reduction, which then leaves no
-        products.
-        """
-        ...
 
 
 def counted(number: int, noun: str) -> str:

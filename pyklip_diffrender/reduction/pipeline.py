@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from astropy.table import QTable
 from astropy.time import Time
@@ -181,13 +181,6 @@ class ReductionResult:
         return f"{head}\n{self.detection._repr_html_()}"
 
 
-class Keeper(Protocol):
-    """Receiver of the products of a reduction as they come, such as a `ProductFolder`."""
-
-    def keep(self, reduction: ReductionResult) -> object:
-        """Keep the products so far, before the next stage begins."""
-
-
 # From a sequence of frames to planets: reference stars, pattern, joint fit, search.
 
 _log = logging.getLogger(__name__)
@@ -310,13 +303,18 @@ class Preparation:
     # The wavefront to start from at another date; None for the same at all dates.
     opd_at: Callable[[Time | None], OPDMap] | None = None
 
-    def run(self, *, progress: bool = False, products: Keeper | None = None) -> ReductionResult:
+    def run(
+        self,
+        *,
+        progress: bool = False,
+        keep: Callable[[ReductionResult], object] | None = None,
+    ) -> ReductionResult:
         """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
 
-        `products` gets the products as they come.
+        `keep` gets the products so far, before the next stage begins.
         """
         with numbered_stages():
-            return _Run(self, progress, products).result()
+            return _Run(self, progress, keep).result()
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +323,7 @@ class _Run:
 
     preparation: Preparation
     progress: bool
-    products: Keeper | None = None
+    keep: Callable[[ReductionResult], object] | None = None
 
     def result(self) -> ReductionResult:
         options = self.preparation.options
@@ -369,11 +367,11 @@ class _Run:
             )
 
         def keep() -> None:
-            if self.products is not None:
+            if self.keep is not None:
                 with stage("products so far"):
-                    self.products.keep(reduction())
+                    self.keep(reduction())
 
-        if self.products is not None or not options.disk:
+        if self.keep is not None or not options.disk:
             with stage("search"):
                 # Where limits with and without the reference stars were compared, it was searched.
                 detection = detection or self._search(fit)

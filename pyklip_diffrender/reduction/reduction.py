@@ -318,7 +318,7 @@ def reduce(
             raise TypeError("reduce() got overwrite without output, a folder")
         return _writable(prepare(sequence, opd, options).run(progress=progress))
     products = ProductFolder(output, overwrite=overwrite)
-    result = prepare(sequence, opd, options).run(progress=progress, products=products)
+    result = prepare(sequence, opd, options).run(progress=progress, keep=products.keep)
     products.keep(result)
     return _writable(result)
 

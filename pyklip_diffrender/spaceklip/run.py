@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from astropy import units as u
@@ -40,23 +40,8 @@ from pyklip_diffrender.spaceklip.database_files import (
 logger = logging.getLogger(__name__)
 
 
-class Database(Protocol):
-    """The part of a `spaceKLIP.database.Database` that `run_obs` uses."""
-
-    output_dir: str
-    # Frames and products of every concatenation.
-    obs: dict[str, Table]
-    red: dict[str, Table]
-
-    def read_jwst_s3_data(self, datapaths: list[str]) -> None:
-        """Add products to `red`."""
-
-    def update_src(self, key: str, index: int, tab: Table) -> None:
-        """Store the sources of product `index` of a concatenation."""
-
-
 def run_obs(
-    database: Database,
+    database: Any,
     *,
     opd: Any,
     restrict_to: str | None = None,
@@ -230,9 +215,7 @@ def _filter(table: Table) -> str:
     return str(table["FILTER"][0])
 
 
-def _fluxes(
-    star_flux: Mapping[str, float | str | u.Quantity], database: Database
-) -> dict[str, float]:
+def _fluxes(star_flux: Mapping[str, float | str | u.Quantity], database: Any) -> dict[str, float]:
     """Flux densities by filter, Jy."""
     filters = {_filter(table) for table in database.obs.values()}
     for name in star_flux:
@@ -312,7 +295,7 @@ def _reduced(
     return product, detection
 
 
-def _store(database: Database, product: Path, sources: Table) -> None:
+def _store(database: Any, product: Path, sources: Table) -> None:
     """Add sources to the database, at the place of the product that they are in."""
     for key, table in database.red.items():
         paths = [os.fspath(path) for path in table["FITSFILE"]]
