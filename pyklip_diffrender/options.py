@@ -163,8 +163,8 @@ References: TypeAlias = Literal["joint", "pattern", "off"]
 Accuracy: TypeAlias = Literal["full", "quick"]
 
 
-_SIDE, QUICK_SIDE = 80, 56
-"""Default sides of the fitted square, pixels."""
+SIDE, QUICK_SIDE = 80, 56
+"""Default sides of the fitted square, pixels: 80 are 5 arcsec, the reach of the occulter."""
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ class SharedOptions:
     @property
     def side(self) -> int:
         """Side of the fitted square, pixels: `size`, or the default where it is None."""
-        return _SIDE if self.size is None else self.size
+        return SIDE if self.size is None else self.size
 
 
 @dataclass(frozen=True)

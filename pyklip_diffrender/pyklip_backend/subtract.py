@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.progress import heard_by
-from pyklip_diffrender.options import QUICK_SIDE, ReduceOptions
+from pyklip_diffrender.options import QUICK_SIDE, SIDE, ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.fitted_star import (
     Fit,
@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.refinement import Refinement
 
 _log = logging.getLogger(__name__)
-
-FIT_PIXELS = 80
-"""Default side of the fitted square: 5 arcsec, the reach of the occulter."""
 
 
 def subtract_by_refinement(
@@ -196,7 +193,7 @@ def model_of(
     if settings.pixelscale is not None:
         options = {"pixelscale": observation.pixelscale, **options}
     is_quick = settings.accuracy == "quick"
-    most = QUICK_SIDE if is_quick else FIT_PIXELS
+    most = QUICK_SIDE if is_quick else SIDE
     size = settings.size or min(most, *Window.holding(observation.valid).shape)
     if is_quick:
         # Takes a second to import.
