@@ -28,7 +28,7 @@ from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.detector_pattern import caveat
 from pyklip_diffrender.scene.observation import Observation
 
-_LIMITS_ARCSEC = (0.5, 1.0, 1.5, 2.0)
+LIMITS_ARCSEC = (0.5, 1.0, 1.5, 2.0)
 """Separations at which limits are stated, arcsec."""
 
 _STATED_LIBRARIES = ("torch", "numpy", "scipy", "astropy", "photutils", "matplotlib")
@@ -266,7 +266,7 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
     if not len(curve):
         return []
     separation = curve["separation"].to_value("arcsec")
-    inside = [s for s in _LIMITS_ARCSEC if separation[0] - 1e-6 <= s <= separation[-1] + 1e-6]
+    inside = [s for s in LIMITS_ARCSEC if separation[0] - 1e-6 <= s <= separation[-1] + 1e-6]
     rows = []
     # Limits fall by orders of magnitude with the separation: their logarithms are interpolated.
     for separation_arcsec in inside or [separation[-1]]:

@@ -15,13 +15,11 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.io.progress import duration
 from pyklip_diffrender.reduction import COMPARISON
 from pyklip_diffrender.reduction.pages import Picture, count, render
+from pyklip_diffrender.reduction.summary import LIMITS_ARCSEC
 from pyklip_diffrender.surveys.jobs import Job, Record
 from pyklip_diffrender.surveys.stars import StarSearch
 
 # The table of results: one row for each job.
-
-_AT_ARCSEC = (0.5, 1.0, 1.5, 2.0)
-"""Separations of the limits, arcsec."""
 
 COLUMNS: dict[str, tuple[type, str]] = {
     "name": (str, "sequence: target and filter, unless the configuration names it"),
@@ -42,7 +40,7 @@ COLUMNS: dict[str, tuple[type, str]] = {
     "contrast_error": (float, "standard deviation of contrast"),
     **{
         f"limit_{each:.1f}_arcsec": (float, f"contrast limit at {each:g} arcsec")
-        for each in _AT_ARCSEC
+        for each in LIMITS_ARCSEC
     },
     "injected_contrast": (float, ""),
     "injected_separation_arcsec": (float, ""),
@@ -152,7 +150,7 @@ def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
         pictures=_pictures(jobs),
         separations=[
             each
-            for each in _AT_ARCSEC
+            for each in LIMITS_ARCSEC
             if any(row[f"limit_{each:.1f}_arcsec"] is not None for row in rows)
         ],
         candidates=[
