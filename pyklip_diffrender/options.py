@@ -163,6 +163,9 @@ References: TypeAlias = Literal["joint", "pattern", "off"]
 Accuracy: TypeAlias = Literal["full", "quick"]
 
 
+SPECTRA = ("blackbody", "flat", "free")
+"""Spectra of planets in searches over filters, unless others are asked for."""
+
 SIDE, QUICK_SIDE = 80, 56
 """Default sides of the fitted square, pixels: 80 are 5 arcsec, the reach of the occulter."""
 

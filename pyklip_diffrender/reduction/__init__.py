@@ -1,6 +1,6 @@
 """`reduce`: from a sequence of frames to planets, with a report."""
 
-from pyklip_diffrender.options import ReduceOptions
+from pyklip_diffrender.options import SPECTRA, ReduceOptions
 from pyklip_diffrender.reduction.pipeline import Preparation, ReductionResult, prepare
 from pyklip_diffrender.reduction.products import (
     PRODUCTS,
@@ -10,7 +10,6 @@ from pyklip_diffrender.reduction.products import (
 from pyklip_diffrender.reduction.reduction import Reduction, reduce
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
-    SPECTRA,
     by_star,
     combined_rows,
     in_words,

@@ -20,11 +20,9 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Combination, Detection, combine
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.options import SPECTRA
 from pyklip_diffrender.reduction.pages import Picture, plus_minus, probability, render, scientific
 from pyklip_diffrender.scene.exposure import CatalogueStar, star_of
-
-SPECTRA = ("blackbody", "flat", "free")
-"""Spectra of planets in searches over filters, unless others are asked for."""
 
 COMPARISON = ("comparison.html", "comparison.json")
 """Files that `write_comparison` writes."""

@@ -13,7 +13,7 @@ from typing import Any
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.units import full_circle, to_bytes
-from pyklip_diffrender.options import OPTIONS, Option, SharedOptions
+from pyklip_diffrender.options import OPTIONS, SPECTRA, Option, SharedOptions
 from pyklip_diffrender.scene.associations import matches
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
@@ -23,9 +23,6 @@ _PIXEL_ARCSEC = 0.063
 _WORKERS = Option(
     "workers", None, "Processes.", int, expected="a number of processes, 0 or more"
 )  # fmt: skip
-
-_SPECTRA = ("blackbody", "flat", "free")
-"""Names of spectra that `combine` knows."""
 
 _NOT_IN_TOML = ("basis", "prior", "drift", "dither_drift", "companions", "memory")
 """Fields of FitSettings that are objects of Python, and the memory, for which surveys have
@@ -210,7 +207,7 @@ class _Reader:
         given = self.values(top.pop("options", {}), "options", self.option_keys)
         options = self.options(given, Options(), "options")
         planets = self.injections(top.pop("injections", {}), Injections(), "injections")
-        names = ", ".join(map(repr, _SPECTRA))
+        names = ", ".join(map(repr, SPECTRA))
         combined = self.values(top.pop("combined", {}), "combined", {
             "spectra": (f"a list of {names} or existing tables", self.spectra),
         })  # fmt: skip
@@ -326,9 +323,7 @@ class _Reader:
 
     def spectra(self, value: Any) -> tuple[str, ...]:
         """Spectra of planets: their names, or paths of tables."""
-        return tuple(
-            each if each in _SPECTRA else str(self.existing(each)) for each in _list(value)
-        )
+        return tuple(each if each in SPECTRA else str(self.existing(each)) for each in _list(value))
 
     def existing(self, value: Any) -> Path:
         """A path that exists."""
