@@ -23,9 +23,7 @@ from pyklip_diffrender.scene.pixel_checks import (
     why_no_star,
     why_odd_unit,
 )
-
-_SENSED = "RESULT_PHASE"
-"""Extension of wavefront-sensing files of MAST."""
+from pyklip_diffrender.wavefront.wss import EXTENSION
 
 _MAP = "it is an OPD map, no frame of a star; OPD maps are given as opd"
 
@@ -144,7 +142,7 @@ def _why_a_product(hdus: fits.HDUList) -> str:
 
 def _is_map(hdu: Any) -> bool:
     """Whether an HDU has a map of path differences, as wavefront sensing writes them."""
-    if hdu.name == _SENSED:
+    if hdu.name == EXTENSION:
         return True
     unit = u.Unit(str(hdu.header.get("BUNIT", "")), parse_strict="silent")
     return bool(hdu.is_image and unit.is_equivalent(u.m))
