@@ -35,7 +35,6 @@ from pyklip_diffrender.surveys.jobs import (
     Injection,
     Job,
     Record,
-    encodable,
     finished,
     publish,
     read_record,
@@ -161,8 +160,8 @@ def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) ->
     record: Record = {
         **circumstances,
         "status": "failed",
-        "message": encodable(f"{type(error).__name__}: {error}".removesuffix(": ")),
-        "traceback": encodable("".join(traceback.format_exception(error))),
+        "message": f"{type(error).__name__}: {error}".removesuffix(": "),
+        "traceback": "".join(traceback.format_exception(error)),
         "result": {},
     }
     with suppress(OSError), staged(jobs, job.key) as folder:
