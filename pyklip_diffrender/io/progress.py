@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -49,24 +48,6 @@ def numbered_stages() -> Iterator[None]:
     finally:
         if token is not None:
             _NUMBERS.reset(token)
-
-
-@contextmanager
-def heartbeat(say: Callable[[], str]) -> Iterator[None]:
-    """Write a line to the log every minute, whatever else is done or waited for inside."""
-    ended = threading.Event()
-
-    def beat() -> None:
-        while not ended.wait(_LOG_INTERVAL_SECONDS):
-            _log.info("%s", say())
-
-    thread = threading.Thread(target=beat, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 @contextmanager

@@ -14,7 +14,6 @@ from astropy.table import Table
 from tqdm import tqdm
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.progress import duration, heartbeat
 from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import Work, in_this_process, with_dask
 from pyklip_diffrender.surveys.jobs import (
@@ -132,10 +131,7 @@ def run_survey(
             len(again), "; ".join(map(str, again)),
         )  # fmt: skip
     try:
-        with (
-            tqdm(total=len(missing), desc="survey", disable=not progress) as bar,
-            heartbeat(board.words),
-        ):
+        with tqdm(total=len(missing), desc="survey", disable=not progress) as bar:
             for job, record in _execute(missing, jobs, read, scheduler, work):
                 board.add(job, record)
                 bar.set_postfix(failed=board.failures)
@@ -179,7 +175,7 @@ class _Board:
             record = read_record(output / "jobs" / job.folder)
             if record is not None:
                 self.records[job.key] = record
-        self.next, self.began = 0.0, time.monotonic()
+        self.next = 0.0
 
     def has(self, job: Job) -> bool:
         """Whether a job is finished; failed ones are tried again."""
@@ -187,15 +183,7 @@ class _Board:
 
     @property
     def failures(self) -> int:
-        return sum(each["status"] == "failed" for each in tuple(self.records.values()))
-
-    def words(self) -> str:
-        """How far the survey is, in a line."""
-        finished = sum(self.has(job) for job in self.todo)
-        return (
-            f"survey: {finished} of {len(self.todo)} jobs finished, {self.failures} failed, "
-            f"after {duration(time.monotonic() - self.began)}"
-        )
+        return sum(each["status"] == "failed" for each in self.records.values())
 
     @property
     def jobs(self) -> list[tuple[Job, Record | None]]:
