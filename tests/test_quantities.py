@@ -10,7 +10,7 @@ from astropy import units as u
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.refinement.forward import Problem
-from pyklip_diffrender.wavefront import SegmentMotions, as_opd_map, random_drift
+from pyklip_diffrender.wavefront import as_opd_map, random_drift
 
 OPD = dr.wavefront.random_opd(1, npix=64).data
 
@@ -41,13 +41,6 @@ def problem(**start):
     made = Problem(model, frames, as_opd_map(OPD), start)
     optical = [value.tolist() for value in made.optical_start(()).values()]
     return [optical, made.start.get("flux"), made.start.get("background")]
-
-
-def prior(**arguments):
-    learned = dr.wavefront.learn_prior(
-        arguments["maps"], SegmentMotions(), npix=32, diameter=arguments["diameter"]
-    )
-    return sorted(learned.scales.values())
 
 
 CASES = {
@@ -94,10 +87,6 @@ CASES = {
     }),
     "random_drift": (lambda hours: random_drift(1, hours, npix=32).data, {
         "hours": (90 * u.min, 1.5),
-    }),
-    "learn_prior": (prior, {
-        "maps": ([OPD * 0 * u.m, OPD * 1e9 * u.nm], [OPD * 0, OPD]),
-        "diameter": (660 * u.cm, 6.6),
     }),
     "WavefrontPrior": (dr.wavefront.WavefrontPrior, {
         "scales": (

@@ -8,8 +8,7 @@ import torch
 from derivatives import difference, parameter_jacobian
 from scipy.stats import multivariate_normal
 
-from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.instrument import jwst_pupil, nircam_coronagraph
+from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.linear import (
     NANOMETRE,
     LastPupil,
@@ -26,7 +25,6 @@ from pyklip_diffrender.wavefront import (
     JointBasis,
     SegmentMotions,
     WavefrontPrior,
-    learn_prior,
     random_opd,
     solve_with_evidence,
 )
@@ -305,26 +303,3 @@ def test_the_prior_falls_with_frequency():
     torch.testing.assert_close(shape[at_three], torch.full_like(shape[at_three], 0.5))
     order = BASIS.frequencies[54:].argsort()
     assert (np.diff(shape[54:][order].numpy()) <= 0).all()
-
-
-def test_a_prior_is_learnt_from_maps():
-    """Random walks with known scales, seen on the mirror only."""
-    basis = JointBasis([SegmentMotions(), FourierModes(10)])
-    truth = WavefrontPrior(scales={"segment": 3.0, "texture": 0.4}, knee=3.0, slope=1.5)
-    scales = torch.tensor([3.0, 0.4], dtype=torch.float64)
-    deviation = scales[basis.group_index] * truth.shape(basis)
-    grid = PupilGrid.full(128)
-    mirror = (jwst_pupil(128) > 0).numpy()
-    generator = torch.Generator().manual_seed(3)
-    drawn = torch.randn(12, len(basis), dtype=torch.float64, generator=generator) * deviation
-    steps = [basis.opd(each, grid).numpy() * 1e-9 * mirror for each in drawn]
-    maps = np.cumsum([np.zeros((128, 128)), *steps], axis=0)
-    found = learn_prior(maps, basis)
-    # Segment motions and low Fourier modes look alike: what one has, the other may take.
-    assert found.scales["segment"] == pytest.approx(3.0, rel=0.3)
-    learnt = torch.tensor([found.scales[name] for name in basis.groups], dtype=torch.float64)
-    ratio = (learnt[basis.group_index] * found.shape(basis) / deviation)[basis.frequencies > 5]
-    assert float(ratio.min()) > 0.6
-    assert float(ratio.max()) < 1.6
-    with pytest.raises(ShapeError, match="at least two"):
-        learn_prior(maps[:1], basis)

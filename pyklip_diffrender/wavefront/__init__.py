@@ -17,7 +17,7 @@ from pyklip_diffrender.wavefront.opd import (
     read_opd,
 )
 from pyklip_diffrender.wavefront.opd_map import OPDMap
-from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior, solve_with_evidence
+from pyklip_diffrender.wavefront.priors import WavefrontPrior, solve_with_evidence
 from pyklip_diffrender.wavefront.wss import interpolate_wss
 
 __all__ = [
@@ -30,7 +30,6 @@ __all__ = [
     "choose_opd",
     "default_basis",
     "interpolate_wss",
-    "learn_prior",
     "opd_for",
     "random_drift",
     "random_opd",

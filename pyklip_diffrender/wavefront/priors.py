@@ -7,21 +7,16 @@ modes, is stationary (D. MacKay, "Bayesian interpolation", Neural Computation 4,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from astropy import units as u
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
-from scipy.optimize import minimize
 from torch import Tensor
 
-from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.io.units import set_numbers, to_metres, to_number
-from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, resample
-from pyklip_diffrender.wavefront.bases import Basis, coefficients_of
+from pyklip_diffrender.io.units import set_numbers, to_number
+from pyklip_diffrender.wavefront.bases import Basis
 
 _CURVATURE_ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
@@ -143,82 +138,6 @@ class EvidenceUpdate:
         """Return the solution in other units; `unit`, (parameters,), is an old unit in new ones."""
         variance = None if self.variance is None else self.variance * unit**2
         return replace(self, step=self.step * unit, variance=variance)
-
-
-def learn_prior(
-    maps: Sequence[NDArray[np.float64]],
-    basis: Basis,
-    *,
-    diameter: float = JWST_DIAMETER,
-    npix: int = 128,
-) -> WavefrontPrior:
-    """Derive a prior from the differences of successive OPD maps.
-
-    Parameters
-    ----------
-    maps : sequence of ndarray, (n, n)
-        At least two maps, m, entrance-pupil orientation; 0 or constant outside the mirror.
-    basis : Basis
-    diameter : float or Quantity
-        Side of the maps, m.
-    npix : int
-        Samples on which modes are fitted; the maps are averaged onto them.
-
-    Returns
-    -------
-    WavefrontPrior
-        Most probable scales of the groups, knee and slope for the fitted coefficients. `refine`
-        starts from these scales and fits them.
-
-    Raises
-    ------
-    ShapeError
-        For fewer than two maps, or maps of different shapes.
-
-    Examples
-    --------
-    >>> import pyklip_diffrender as dr
-    >>> from pyklip_diffrender.wavefront.bases import FourierModes
-    >>> maps = [dr.wavefront.random_opd(seed, npix=128).data for seed in (1, 2, 3)]
-    >>> prior = dr.wavefront.learn_prior(maps, FourierModes(4))
-    >>> list(prior.scales), prior.fit_scales
-    (['texture'], True)
-    """
-    stack = np.asarray([to_metres(opd, "maps") for opd in maps])
-    diameter = to_number(diameter, u.m, "diameter", "positive")
-    if stack.ndim != 3 or len(stack) < 2:
-        raise ShapeError(f"maps: got shape {stack.shape}, expected at least two square maps")
-    changes = np.diff(stack, axis=0) * 1e9
-    grid = PupilGrid.full(npix, diameter)
-    averaged = np.stack([resample(change, npix) for change in changes])
-    fitted = coefficients_of(torch.from_numpy(averaged), basis, grid)
-    coefficients = fitted.square().mean(dim=0).sqrt().numpy()
-    frequency, group = basis.frequencies.numpy(), basis.group_index.numpy()
-
-    # A coefficient c with the deviation s has -log p = log s + c^2 / 2 s^2, up to a constant; s is
-    # the scale of its group over 1 + (frequency / knee)^slope.
-    def deviations(logs: NDArray[np.float64]) -> NDArray[np.float64]:
-        scales, knee, slope = np.exp(logs[:-2]), np.exp(logs[-2]), np.exp(logs[-1])
-        return np.asarray(scales[group] / (1 + (frequency / knee) ** slope))
-
-    def surprise(logs: NDArray[np.float64]) -> float:
-        expected = deviations(logs)
-        return float(np.sum(np.log(expected) + 0.5 * (coefficients / expected) ** 2))
-
-    groups = len(basis.groups)
-    typical = [0.5 * np.log(np.mean(coefficients[group == k] ** 2) + 1e-12) for k in range(groups)]
-    answer = minimize(
-        surprise,
-        np.array([*typical, np.log(8.0), 0.0]),
-        method="L-BFGS-B",
-        bounds=[(None, None)] * groups + [(0.0, np.log(1e3)), (np.log(0.1), np.log(6.0))],
-    )
-    scales = np.exp(answer.x[:-2])
-    return WavefrontPrior(
-        scales={name: float(s) for name, s in zip(basis.groups, scales, strict=True)},
-        knee=float(np.exp(answer.x[-2])),
-        slope=float(np.exp(answer.x[-1])),
-    )
 
 
 def _invert_lower(factor: Tensor) -> Tensor:
