@@ -57,9 +57,6 @@ CASES = {
     "Star": (dr.Star, {
         "w2_magnitude": (4 * u.mag, 4),
         "exposure": (2 * u.h, 7200.0),
-        "zero_point": (184100 * u.mJy, 184.1),
-        "pixel_area": (0.004 * u.arcsec**2, 0.004 * (math.pi / 648000) ** 2),
-        "gain": (1.8 * u.electron / u.ct, 1.8),
     }),
     "Scene": (dr.Scene, {
         "star_offset": ([5 * u.mas, -0.02 * u.arcsec], (0.005, -0.02)),

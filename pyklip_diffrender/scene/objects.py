@@ -36,10 +36,29 @@ UNOCCULTED_PEAK = 3.71638e-3
 """Fraction of the light collected by the pupil that falls on the brightest pixel of the paper's
 star, with the Lyot stop but without the occulter, at 4.5 um."""
 
+_ZERO_POINT = 184.1
+"""Flux density of magnitude 0 in F444W, Jy."""
+
+_MJYSR_PER_CPS = 2.516
+"""MJy/sr that make one count per second (PHOTMJSR of F444W behind MASK335R)."""
+
+_GAIN = 1.82
+"""Electrons per count."""
+
+_QUANTUM_EFFICIENCY = 0.8
+"""Electrons per photon."""
+
+_PIXEL_AREA = (0.062424185 * ARCSEC) ** 2
+"""Solid angle of a pixel, sr."""
+
+_PEAK_FRACTION = 0.0148002
+"""Fraction of a point source's calibrated flux that falls on its brightest pixel. The paper does
+not state it; it follows from its other numbers, with its 1.0334e10 photons at contrast 1."""
+
 
 @dataclass(frozen=True)
 class Star:
-    """A star with an exposure, and the calibration that turns both into photons.
+    """A star and its exposure, in the calibration of the paper.
 
     Every value may be a Quantity.
 
@@ -49,20 +68,6 @@ class Star:
         WISE W2, 4.6 um.
     exposure : float
         Seconds.
-    zero_point : float
-        Flux density of magnitude 0 in F444W, Jy.
-    mjysr_per_cps : float
-        MJy/sr that make one count per second (PHOTMJSR of F444W behind MASK335R).
-    gain : float
-        Electrons per count.
-    quantum_efficiency : float
-        Electrons per photon.
-    pixel_area : float
-        Solid angle of a pixel, sr.
-    peak_fraction : float
-        Fraction of a point source's calibrated flux that falls on its brightest pixel. The paper
-        does not state it. 0.0148002 follows from its other numbers, with its 1.0334e10 photons
-        at contrast 1.
 
     Examples
     --------
@@ -74,32 +79,16 @@ class Star:
 
     w2_magnitude: float = BETA_PICTORIS_W2
     exposure: float = 7200.0
-    zero_point: float = 184.1
-    mjysr_per_cps: float = 2.516
-    gain: float = 1.82
-    quantum_efficiency: float = 0.8
-    pixel_area: float = (0.062424185 * ARCSEC) ** 2
-    peak_fraction: float = 0.0148002
 
     def __post_init__(self) -> None:
-        set_numbers(
-            self,
-            w2_magnitude=(u.mag, "any"),
-            exposure=(u.s, "positive"),
-            zero_point=(u.Jy, "positive"),
-            mjysr_per_cps=(u.MJy / u.sr, "positive"),
-            gain=(u.electron / u.ct, "positive"),
-            quantum_efficiency=("", "positive"),
-            pixel_area=(u.sr, "positive"),
-            peak_fraction=("", "positive"),
-        )
+        set_numbers(self, w2_magnitude=(u.mag, "any"), exposure=(u.s, "positive"))
 
     @property
     def peak_photons(self) -> float:
         """Photons in the brightest pixel of the unocculted star, the paper's contrast of 1."""
-        flux = self.zero_point * 10 ** (-0.4 * self.w2_magnitude)
-        counts_per_second = flux * 1e-6 / self.pixel_area * self.peak_fraction / self.mjysr_per_cps
-        return counts_per_second * self.exposure * self.gain / self.quantum_efficiency
+        flux = _ZERO_POINT * 10 ** (-0.4 * self.w2_magnitude)
+        counts_per_second = flux * 1e-6 / _PIXEL_AREA * _PEAK_FRACTION / _MJYSR_PER_CPS
+        return counts_per_second * self.exposure * _GAIN / _QUANTUM_EFFICIENCY
 
     @property
     def photons(self) -> float:
