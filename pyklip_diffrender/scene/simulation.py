@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,8 +30,6 @@ from pyklip_diffrender.wavefront.opd import random_opd
 
 # The model for a real frame.
 
-Items = tuple[tuple[str, Any], ...]
-
 _PUPIL_SAMPLES = 256
 """Samples across the pupil. The error of so coarse a grid, 2 % of the image, is static, and the
 fit absorbs it: with 256 and 512 samples the residual of real frames was the same."""
@@ -48,7 +45,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
 
     Frames whose header says NIRCam get the detector's scale and shear from the SIAF, and the Lyot
     stop in its place in flight, or in its nominal place if that was not measured (short wave and
-    bars). A fit starts from this model. A model that was made before is used again.
+    bars). A fit starts from this model.
 
     Parameters
     ----------
@@ -123,12 +120,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             else None,
         }
     arguments |= overrides
-    defaults = arguments.pop("defaults", None)
-    items = tuple(sorted(arguments.items()))
-    try:
-        return _cached_model(observation.filter, items, tuple(sorted((defaults or {}).items())))
-    except TypeError:  # An argument that cannot be a key, such as a spectrum in arrays.
-        return _model(observation.filter, items, tuple((defaults or {}).items()))
+    return nircam_coronagraph(observation.filter, **arguments)
 
 
 def _place_of(observation: Observation, mask: str | None = None) -> DetectorPlace:
@@ -209,13 +201,6 @@ def images_of_stars(
     with torch.no_grad():
         images = [model(wavefront, (0.0, y)).double().cpu().numpy() for y in (0.0, away)]
     return images[0], images[1]
-
-
-def _model(name: str, items: Items, defaults: Items) -> OpticalSystem:
-    return nircam_coronagraph(name, **dict(items), defaults=dict(defaults))
-
-
-_cached_model = lru_cache(maxsize=4)(_model)
 
 
 # Simulated observations: the model's image of a scene, with shot and read noise.
