@@ -199,7 +199,7 @@ def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path):
     assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
 
 
-def test_folders_say_what_their_jobs_are(tmp_path):
+def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path):
     config, output = inputs(tmp_path / "a", 1), tmp_path / "out"
     config["sequence"][0] |= {"name": "β Pic, F444W"}
     config["injections"] = PLANET
@@ -209,12 +209,15 @@ def test_folders_say_what_their_jobs_are(tmp_path):
         f"Pic-F444W-planet-of-1e-05-at-0.5-arcsec-0-deg_{jobs[1].key[:12]}",
     ]
     assert jobs[1].base_folder == jobs[0].folder
-    table = run_survey(config, output, stub)
+    run_survey(config, output, stub)
+    config["sequence"][0] |= {"name": "another"}
+    # Without any work that would fail.
+    table = run_survey(config, output, lambda job, folder: 1 / 0)
     assert list(table["status"]) == ["finished"] * 2
     names = sorted(path.name for path in (output / "jobs").iterdir())
-    assert names == sorted(table["folder"]) == sorted(job.folder for job in jobs)
-    page = (output / "survey.html").read_text(encoding="utf-8")
-    assert "<title>Survey of β Pic, F444W</title>" in page
+    assert names == sorted(table["folder"]) == sorted(job.folder for job in planned(config))
+    page = (output / "survey.html").read_text()
+    assert "<title>Survey of another</title>" in page
     assert f'"jobs/{names[0]}/report.html"' in page
 
 

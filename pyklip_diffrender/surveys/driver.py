@@ -23,6 +23,7 @@ from pyklip_diffrender.surveys.jobs import (
     jobs_of,
     prepare,
     read_record,
+    rename_to_jobs,
     staged,
 )
 from pyklip_diffrender.surveys.stars import StarSearch, search_stars
@@ -115,6 +116,7 @@ def run_survey(
     output = Path(output).absolute()
     jobs = prepare(output)
     clean(jobs)
+    rename_to_jobs(jobs, todo)
     board = _Board(todo, output)
     missing = [job for job in todo if not board.has(job)]
     _log.info("%d of %d jobs are finished", len(todo) - len(missing), len(todo))

@@ -9,7 +9,7 @@ import os
 import secrets
 import shutil
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
@@ -322,6 +322,17 @@ def read_record(final: Path) -> Record | None:
         return record if whole and record["status"] in ("finished", "failed") else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+def rename_to_jobs(jobs: Path, todo: Iterable[Job]) -> None:
+    """Rename folders of jobs whose sequences have another name in the configuration by now."""
+    names = {job.folder.rpartition("_")[2]: job.folder for job in todo}
+    for path in jobs.iterdir():
+        name = names.get(path.name.rpartition("_")[2], path.name)
+        if name != path.name and not (jobs / name).exists():
+            # Somebody else may be faster.
+            with suppress(FileNotFoundError):
+                os.rename(path, jobs / name)
 
 
 def finished(final: Path) -> bool:
