@@ -35,6 +35,7 @@ from pyklip_diffrender.surveys.jobs import (
     Injection,
     Job,
     Record,
+    encodable,
     finished,
     publish,
     read_record,
@@ -160,8 +161,8 @@ def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) ->
     record: Record = {
         **circumstances,
         "status": "failed",
-        "message": f"{type(error).__name__}: {error}".removesuffix(": "),
-        "traceback": "".join(traceback.format_exception(error)),
+        "message": encodable(f"{type(error).__name__}: {error}".removesuffix(": ")),
+        "traceback": encodable("".join(traceback.format_exception(error))),
         "result": {},
     }
     with suppress(OSError), staged(jobs, job.key) as folder:

@@ -304,11 +304,24 @@ def write_record(folder: Path, job: Job, record: Mapping[str, Any]) -> Record:
     about = asdict(job)
     # JSON has no infinity.
     about["options"]["settings"] = {k: repr(v) for k, v in job.options.settings.items()}
-    whole = {**record, "job": about, "products": products}
+    whole = encodable({**record, "job": about, "products": products})
     text = json.dumps(whole, indent=2, allow_nan=False) + "\n"
     (folder / RECORD).write_text(text, encoding="utf-8")
     read: Record = json.loads(text)
     return read
+
+
+def encodable(value: Any) -> Any:
+    """Make the text in nested values such that UTF-8 can encode it."""
+    # Names of files, and messages that quote them, may have bytes of another encoding, which Python
+    # keeps as surrogates and no table takes.
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode("utf-8")
+    if isinstance(value, Mapping):
+        return {encodable(key): encodable(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [encodable(each) for each in value]
+    return value
 
 
 def read_record(final: Path) -> Record | None:
