@@ -225,17 +225,31 @@ def test_a_frame_of_the_whole_detector_takes_less_than_two_gigabytes(tmp_path):
     assert peak < 2e6
 
 
-def test_sources_far_from_the_star_are_not_behind_a_bar():
-    """10 arcsec to the left and right of the star, a bar still takes all light of a source."""
-    behind = dr.nircam_coronagraph(
-        "F444W", image_mask="MASKLWB", monochromatic=4.5e-6, npix=256, fov_pixels=24
+@cache
+def behind_a_bar():
+    """A model of MASKLWB, which takes all light out to 10 arcsec left and right of the star."""
+    model = dr.nircam_coronagraph(
+        "F444W", image_mask="MASKLWB", monochromatic=4.5e-6, npix=256, fov_pixels=32
     )
-    opd = dr.wavefront.random_opd(1, npix=256)
+    return model, dr.wavefront.random_opd(1, npix=256)
+
+
+def test_sources_far_from_the_star_are_not_behind_a_bar():
+    behind, opd = behind_a_bar()
     frame = dr.simulate(behind, dr.Scene(STAR), opd, seed=5)
     settings = dr.FitSettings(wavefront=False, companions_if_stalled=False)
     fit = dr.refine(behind, frame, opd, settings=settings)
     clear = fit.frames[0].flux * float(Templates(fit).beyond_mask(0).max())
     assert WholeFrame(fit.frames[0], frame, 0.0).kernel.max() == pytest.approx(clear, rel=0.1)
+
+
+def test_a_bright_source_beside_a_bar_is_fitted_with_the_star():
+    behind, opd = behind_a_bar()
+    source = dr.Planet.from_offset(1e-3, 0.3, 0.8)
+    frame = dr.simulate(behind, dr.Scene(STAR, planets=(source,)), opd, seed=5)
+    fit = dr.refine(behind, frame, opd, settings=dr.FitSettings(cycles=4))
+    assert fit.status is dr.Status.CONVERGED
+    np.testing.assert_allclose(fit.companions, [[1e-3, *source.offset]], rtol=0.01)
 
 
 WHOLE_DETECTOR = """

@@ -208,6 +208,10 @@ def _rules_of_a_fit() -> list[Breakage]:
             "detection",
         ),
         Breakage(
+            "beyond-bar", "the image of a source is not taken behind a bar",
+            "BEYOND_MASK_ARCSEC = (1.2, 1.2)", "BEYOND_MASK_ARCSEC = (1.7, 0.0)", "wide_field",
+        ),
+        Breakage(
             "deeper-limits", "at every separation the deeper search is used",
             "is_deeper = their_limits < limits", "is_deeper = their_limits < 0 * limits", "deeper",
         ),

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.instrument.masks import BEYOND_MASK_ARCSEC
 from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -35,9 +36,6 @@ templates of the whole bandpass, and their amplitudes by 2e-4. Candidates are me
 
 _SHIFT_ARCSEC = 5e-4
 """arcsec between images whose difference is a derivative; accurate to 1e-4."""
-
-_BEYOND_MASK_ARCSEC = torch.tensor([1.2, 1.2], dtype=torch.float64)
-"""x, y from the star, arcsec, where the transmission of every mask is above 0.9."""
 
 _MOST_KEPT_IMAGES = 200
 """Largest number of images with derivatives that are kept."""
@@ -200,7 +198,7 @@ class Templates:
         It is on neither of the axes, along which bars extend.
         """
         frame = self.frames[k]
-        place = self._star(frame) + _BEYOND_MASK_ARCSEC
+        place = self._star(frame) + torch.tensor(BEYOND_MASK_ARCSEC, dtype=torch.float64)
         # The pixel n // 2 of an even number is half a pixel beyond the middle of the array.
         middle = torch.tensor(
             [

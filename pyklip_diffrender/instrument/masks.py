@@ -109,6 +109,10 @@ class BarMask:
 _HALF_BAR_ARCSEC = 10.0
 """Half the length of a bar, arcsec."""
 
+BEYOND_MASK_ARCSEC = (1.2, 1.2)
+"""x, y from the star, arcsec, where the transmission of every mask is above 0.9: bars extend along
+x."""
+
 _HALF_WEDGE_ARCSEC = 7.5
 """Half the length of the part in which its width changes, arcsec."""
 

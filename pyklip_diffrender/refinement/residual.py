@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, maximum_filter
 from torch import Tensor
 
+from pyklip_diffrender.instrument.masks import BEYOND_MASK_ARCSEC
 from pyklip_diffrender.linear.model import LinearModel, TemplateProducts
 from pyklip_diffrender.optics.convolution import fft_convolve
 from pyklip_diffrender.refinement.forward import Objective, State, pixel_grid
@@ -77,8 +78,8 @@ def _matched(objective: Objective, state: State, k: int, kappa: float) -> _Match
     sigma = torch.where(problem.valid, objective.sigma(k, point, kappa), math.inf).cpu().numpy()
     values = unknowns.values(point.vector)
     star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
-    # The template is an image in the middle of the array of a source beyond the occulter.
-    displacement = torch.tensor([1.5, 0.0], dtype=torch.float64)
+    # The template is an image in the middle of the array of a source beyond the mask.
+    displacement = torch.tensor(BEYOND_MASK_ARCSEC, dtype=torch.float64)
     centred = {
         **values,
         "star_offset": star + displacement,
