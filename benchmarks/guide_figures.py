@@ -224,18 +224,17 @@ def survey_figure() -> Figure:
 
 
 def time_figure() -> Figure:
-    """How times grow, from the table of `benchmarks.speed`."""
-    table = Table.read(RESULTS / "performance.ecsv")
+    """How the time of a fit grows, from the table of `benchmarks.growth`."""
+    table = Table.read(RESULTS / "growth.ecsv")
     figure = Figure(figsize=(6.5, 4), layout="constrained")
     ax = figure.subplots()
-    for name in dict.fromkeys(map(str, table["row"])):
-        if not name.startswith("scaling"):
-            continue
-        rows = table[table["row"] == name]
-        label = name.removeprefix("scaling: ").replace("forward", "image")
-        size = rows["size"] / rows["size"][0]
-        ax.loglog(size, rows["seconds"] / rows["seconds"][0], "o-", label=label)
-    ax.set(xlabel="size over the smallest", ylabel="time over that of the smallest")
+    for k, name in enumerate(dict.fromkeys(map(str, table["size"]))):
+        rows = table[table["size"] == name]
+        size = rows["value"] / rows["value"][0]
+        ax.loglog(size, rows["fit"], f"C{k}o-", label=f"{name} from {rows['value'][0]:g}")
+        ax.loglog(size, rows["counted"], f"C{k}--", lw=1)
+    ax.plot([], [], "k--", lw=1, label="counted operations")
+    ax.set(xlabel="size over the smallest", ylabel="processor time of a fit (s)")
     ax.legend(frameon=False, fontsize=8)
     return figure
 
