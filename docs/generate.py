@@ -155,8 +155,8 @@ SITUATIONS = (
     ),
     Situation(
         "little time", "A full reduction.", {"accuracy": "quick"}, "",
-        "[A first look](../validation/speed_error.md#a-first-look) out to 1.7 arcsec in a third of "
-        "the time.",
+        "[A first look](../validation/speed_error.md#a-first-look) out to 1.7 arcsec in a third "
+        "to half of the time.",
     ),
     Situation(
         "little memory", "Takes what it needs.", {"memory": "2.5 GB"}, "",

@@ -315,7 +315,7 @@ class ReduceOptions(SharedOptions):
             7-34 and HIP 17695, and pairs of them, took 0.22 to 0.39 of the time of a full
             reduction, with limits 0.87 to 1.15 times as high, out to 1.7 arcsec, because the
             star's flux is less certain. Not together with `settings`.""",
-        "help": "A first look with a coarser model near the star, in a third of the time.",
+        "help": "A first look with a coarser model near the star, in a third to half of the time.",
         "flag": "--quick", "not_in_surveys": "they are no first look",
     })  # fmt: skip
     device: str = field(default="cpu", metadata={
