@@ -25,6 +25,9 @@ INK = "#1b1f24"
 ACCENT = "#0b6e4f"
 """A dark green, distinct from both ends of the red and blue maps."""
 
+_LABELLED = 4
+"""Largest number of circles with labels of more than two characters."""
+
 
 def halo() -> list[Any]:
     """Effects that make dark lines and text legible on any image."""
@@ -53,12 +56,14 @@ def label_sky(ax: Axes, oriented: bool, **style: Any) -> None:
 
 
 def circles(ax: Axes, places: ArrayLike, labels: Sequence[str] = ()) -> None:
-    """Draw circles around positions (k, 2), with labels."""
+    """Draw circles around positions (k, 2), with labels unless so many long ones would overlap."""
     x, y = np.reshape(places, (-1, 2)).T
     ax.plot(
         x, y, "o", mfc="none", mec=INK, ms=15, mew=1.6, label="companions", path_effects=halo()
     )  # fmt: skip
-    for label, place in zip(labels, zip(x, y, strict=True), strict=False):
+    is_short = all(len(label) <= 2 for label in labels)
+    shown = labels if is_short or len(x) <= _LABELLED else ()
+    for label, place in zip(shown, zip(x, y, strict=True), strict=False):
         ax.annotate(
             label, place, (0, 11), textcoords="offset points", color=INK, ha="center", va="bottom",
             path_effects=halo(),
