@@ -199,6 +199,7 @@ import sys, time
 from pyklip_diffrender.io.files import replacing
 with replacing(sys.argv[1]) as temporary:
     temporary.write_bytes(b"half")
+    # The test waits for this line, and kills the process while the file is half written.
     print("writing", flush=True)
     time.sleep(60)
 """
