@@ -156,14 +156,12 @@ def conjugate_gradients(
     precondition: Callable[[Tensor], Tensor],
     gradient: Tensor,
     enough: float = 0.0,
-    iterations: int = _GRADIENT_ITERATIONS,
-    sufficient: float = _GRADIENT_TOLERANCE,
 ) -> tuple[Tensor, bool]:
     """Minimise x A x - 2 g x approximately; also whether another iteration would hardly lower it.
 
     `product` gives A x with a positive definite A, `precondition` B^-1 x with an approximation B to
     A, and `gradient` g is (n,). The iteration is the last whose decrease is below `enough`, or
-    below the part `sufficient` of the whole decrease.
+    below the part `_GRADIENT_TOLERANCE` of the whole decrease.
     """
     # Along a direction p, with the remaining gradient r = g - A x and z = B^-1 r, the minimum is at
     # the length (r . z) / (p . A p) and lowers the function by (r . z)^2 / (p . A p), since r is
@@ -173,7 +171,7 @@ def conjugate_gradients(
     remaining = gradient.clone()
     direction = precondition(remaining)
     power, total = float(remaining @ direction), 0.0
-    for _ in range(iterations):
+    for _ in range(_GRADIENT_ITERATIONS):
         if power <= 0:
             return x, True
         # What the preconditioner expects does not tell the decrease. Errors of its Jacobian count
@@ -188,7 +186,7 @@ def conjugate_gradients(
         total += decrease
         # SciPy's `cg` ends by the size of the gradient, which says little where unknowns are nearly
         # degenerate.
-        if decrease < max(sufficient * total, enough):
+        if decrease < max(_GRADIENT_TOLERANCE * total, enough):
             return x, True
         ahead = precondition(remaining)
         power, before = float(remaining @ ahead), power
