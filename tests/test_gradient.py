@@ -24,10 +24,10 @@ SCALES = {"segment": 20.0, "texture": 20.0}
 
 
 @cache
-def solver_of(frames, **changes):
+def solver_of(frames, nlambda=3, **changes):
     """A solver and a state far from the solution, for frames of the same pixels with a pattern."""
     rng = np.random.default_rng(4)
-    model = dr.nircam_coronagraph("F444W", nlambda=3, npix=NPIX, fov_pixels=SIZE)
+    model = dr.nircam_coronagraph("F444W", nlambda=nlambda, npix=NPIX, fov_pixels=SIZE)
     opd = dr.wavefront.random_opd(3, npix=NPIX)
     zeros = np.zeros((SIZE, SIZE))
     pattern = DetectorPattern(
@@ -40,7 +40,7 @@ def solver_of(frames, **changes):
         seen = dr.Observation.from_arrays(data, error, pixelscale=model.detector.pixelscale)
         seen = replace(seen, first_pixel=(600, 1600))
         problems.append(Problem(model, seen, opd, pattern=pattern))
-    # The copy is far coarser than the model, in one of its three wavelengths.
+    # The copy is far coarser than the model, at one of its wavelengths.
     coarse = {"response_npix": 32, "response_wavelengths": 1}
     prior = WavefrontPrior(SCALES, fit_scales=False, amplitude_cycles=2.0, amplitude_scale=2.0)
     settings = FitSettings(free=FREE, basis=BASIS, prior=prior, **coarse, **changes)
@@ -106,7 +106,7 @@ def test_the_gradient_is_that_of_chi_squared(frames):
 
 def of_the_model_itself(solver):
     """A solver whose coarse copy is the model."""
-    settings = replace(solver.settings, response_npix=NPIX, response_wavelengths=3)
+    settings = replace(solver.settings, response_npix=NPIX, response_wavelengths=9)
     problems = [forward.problem for forward in solver.objective.forwards]
     return Solver(problems, settings, BASIS, progress=False)
 
@@ -139,8 +139,11 @@ def test_the_gradient_with_a_companion_is_that_of_chi_squared(contrast):
 
 
 def test_the_curvature_is_that_of_the_model_whatever_the_copy():
-    """Against the equations of a copy that is the model; those of a coarse one are far from it."""
-    solver, state = solver_of(2)
+    """Against the equations of a copy that is the model; those of a coarse one are far from it.
+
+    The curvature has five of the nine wavelengths.
+    """
+    solver, state = solver_of(2, nlambda=9)
     rng = np.random.default_rng(6)
     unit = units(solver, state)
     step = 0.01 * unit * torch.from_numpy(rng.normal(size=len(unit)))

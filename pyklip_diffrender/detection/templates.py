@@ -16,6 +16,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import BEYOND_MASK_ARCSEC
 from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.response import at_half_the_wavelengths
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -172,10 +173,10 @@ class Templates:
             images[k] = torch.stack(rows, dim=1) if slopes else torch.stack(single)
         return images
 
-    def _light(self, k: int, offset: Tensor) -> Tensor:
+    def _light(self, k: int, offset: Tensor, model: OpticalSystem | None = None) -> Tensor:
         """Light of one planet in frame k, (ny, nx), on the CPU."""
         with torch.no_grad():
-            return (self.frames[k].flux * self.image(k, offset)).cpu()
+            return (self.frames[k].flux * self.image(k, offset, model=model)).cpu()
 
     def _with_slopes(self, k: int, offset: Tensor) -> Tensor:
         """Light of a planet and its derivatives by x and y, (3, ny, nx), per arcsec."""
@@ -184,11 +185,12 @@ class Templates:
             if len(self._rendered) >= _MOST_KEPT_IMAGES:
                 self._rendered.clear()
             # Central differences: a fast path renders single stars, but only without forward-mode
-            # derivatives, which take three times as long as four more images.
-            parts = [self._light(k, offset)]
+            # derivatives, which take three times as long as four more images. Half of the
+            # wavelengths change these images by 0.4 % in W filters.
+            parts, fewer = [self._light(k, offset)], at_half_the_wavelengths(self.frames[k].model)
             for step in _SHIFT_ARCSEC * torch.eye(2, dtype=torch.float64):
-                change = self._light(k, offset + step) - self._light(k, offset - step)
-                parts.append(change / (2 * _SHIFT_ARCSEC))
+                ahead, behind = (self._light(k, offset + by, fewer) for by in (step, -step))
+                parts.append((ahead - behind) / (2 * _SHIFT_ARCSEC))
             self._rendered[key] = torch.stack(parts)
         return self._rendered[key]
 
@@ -217,15 +219,22 @@ class Templates:
         """Position of a planet from the occulter in frame k, (2,), arcsec."""
         return self._star(self.frames[k]) + self._turned(k, offset)
 
-    def image(self, k: int, offset: Tensor, change: Tensor | None = None) -> Tensor:
+    def image(
+        self,
+        k: int,
+        offset: Tensor,
+        change: Tensor | None = None,
+        model: OpticalSystem | None = None,
+    ) -> Tensor:
         """One planet at x, y (2,) in frame k, as a fraction of the star's light, (ny, nx).
 
-        `change` is added to the fitted wavefront, (npix, npix), m.
+        `change` is added to the fitted wavefront, (npix, npix), m; `model` is by default the
+        frame's.
         """
         frame = self.frames[k]
         values = {**frame.optical_values, "star_offset": self.place_of(k, offset)}
         opd = _as_tensor(frame.opd)
-        return frame.model(opd if change is None else opd + change, **values).double()
+        return (model or frame.model)(opd if change is None else opd + change, **values).double()
 
 
 def _few_wavelengths(model: OpticalSystem) -> Bandpass:

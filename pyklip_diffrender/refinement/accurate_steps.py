@@ -2,22 +2,21 @@
 
 Normal equations of a coarse copy of the model are wrong where the effects of several unknowns
 cancel, and steps along such directions are too long. Products of the model's own curvature with a
-vector take as long as three images. The coarse copy's equations precondition them, and may come
-from an earlier step.
+vector, at half of the wavelengths, take as long as two images. The coarse copy's equations
+precondition them, and may come from an earlier step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from pyklip_diffrender.linear.model import Noise
-from pyklip_diffrender.refinement.forward import (
-    Objective,
-    State,
-)
+from pyklip_diffrender.refinement.forward import Forward, Objective, Point, State
 
 _GRADIENT_ITERATIONS = 6
 """Largest number of iterations of one step."""
@@ -33,79 +32,103 @@ _CURVATURE_STEP_RATIO = 0.01
 matters less than the rounding errors of single precision."""
 
 
+@dataclass(frozen=True)
+class _Frames:
+    """Frames at a state, their forward models, and their derivatives by levels and companions."""
+
+    forwards: Sequence[Forward]
+    points: Sequence[Point]
+    levels: Sequence[Tensor]  # (unknowns, ny, nx) each, see `Forward.levels`.
+
+    @classmethod
+    def of(cls, forwards: Sequence[Forward], points: Sequence[Point]) -> _Frames:
+        """Frames at points, with all the companions that each one shows."""
+        levels = [
+            forward.levels(point, point.unknowns.visible_sources(point.vector)).double()
+            for forward, point in zip(forwards, points, strict=True)
+        ]
+        return cls(forwards, points, levels)
+
+
 class ModelDerivatives:
     """Gradient and curvature of chi-squared, by derivatives of the model itself."""
 
     def __init__(self, objective: Objective, state: State, noise: Noise) -> None:
         self._objective, self._state, self._noise = objective, state, noise
-        self._levels = [
-            forward.levels(point, point.unknowns.visible_sources(point.vector)).double()
-            for forward, point in zip(objective.forwards, state.points, strict=True)
-        ]
         self._bright = [point.unknowns.are_bright(point.vector) for point in state.points]
-        # The gradient includes all light. In the curvature, which determines the path to the
-        # minimum and not its place, the light of faint companions is linear: it depends on their
-        # contrasts and positions and on the star's flux, and not on the wavefront.
-        self._without_faint = [
-            point if bool(bright.all()) else forward.at(point.unknowns, point.vector, bright)
-            for forward, point, bright in zip(
-                objective.forwards, state.points, self._bright, strict=True
-            )
-        ]
 
     def gradient(self) -> Tensor:
         """Minus half the derivative of chi-squared, (unknowns,)."""
+        residuals = dict(enumerate(self._objective.residuals(self._state)))
         sources = [point.unknowns.visible_sources(point.vector) for point in self._state.points]
-        return self._pull(dict(enumerate(self._objective.residuals(self._state))), sources)
+        frames = _Frames.of(self._objective.forwards, self._state.points)
+        return self._pull(residuals, frames, sources)
+
+    @cached_property
+    def _cheaper(self) -> _Frames:
+        """The frames as the curvature sees them.
+
+        The curvature determines the path to the minimum and not its place. Half of the wavelengths
+        are sufficient, and the light of faint companions is linear: it depends on their contrasts
+        and positions and on the star's flux, and not on the wavefront.
+        """
+        forwards = [forward.at_half_the_wavelengths for forward in self._objective.forwards]
+        points = [
+            forward.at(point.unknowns, point.vector, bright)
+            for forward, point, bright in zip(
+                forwards, self._state.points, self._bright, strict=True
+            )
+        ]
+        return _Frames.of(forwards, points)
 
     def product(self, step: Tensor) -> Tensor:
         """Product of the curvature with a step, (unknowns,)."""
         # A s = J C^-1 (J^T s): a difference of two images along the step s has J^T s, and `_pull`
         # applies J C^-1 in reverse mode.
         vector, images, sources = self._state.vector + _CURVATURE_STEP_RATIO * step, {}, []
-        for k, before in enumerate(self._without_faint):
+        for k, before in enumerate(self._cheaper.points):
             sources.append(before.unknowns.visible_sources(before.vector)[self._bright[k]])
             rows, bright = self._state.unknowns.rows[k], self._bright[k]
-            after = self._objective.forwards[k].at(
-                before.unknowns, rows.of_unknowns(vector), bright
-            )
+            forward = self._cheaper.forwards[k]
+            after = forward.at(before.unknowns, rows.of_unknowns(vector), bright)
             images[k] = (after.total - before.total) / _CURVATURE_STEP_RATIO
             if not bool(bright.all()):
                 images[k] = images[k] + self._change_of_faint(k, rows.of_unknowns(step))
-        return self._pull(images, sources)
+        return self._pull(images, self._cheaper, sources)
 
     def _change_of_faint(self, k: int, step: Tensor) -> Tensor:
         """Change of the light of faint companions in a frame by a step of its unknowns."""
-        point = self._state.points[k]
+        frames, point = self._cheaper, self._cheaper.points[k]
         unknowns, faint = point.unknowns, ~self._bright[k]
         of_companions = step[unknowns.where("companions")]
-        rows = self._levels[k][-len(of_companions) :].unflatten(0, (-1, 3))[faint].flatten(0, 1)
+        rows = frames.levels[k][-len(of_companions) :].unflatten(0, (-1, 3))[faint].flatten(0, 1)
         change = torch.tensordot(of_companions.reshape(-1, 3)[faint].flatten(), rows, dims=1)
-        light = point.total - self._without_faint[k].total
+        light = frames.forwards[k].at(unknowns, point.vector).total - point.total
         change_of_flux = unknowns.level("flux", step) if "flux" in unknowns.linear else 0.0
         relative = change_of_flux / unknowns.level("flux", point.vector)
         return relative * light + change.to(light.device)
 
-    def _pull(self, images: Mapping[int, Tensor], sources: Sequence[Tensor]) -> Tensor:
+    def _pull(
+        self, images: Mapping[int, Tensor], frames: _Frames, sources: Sequence[Tensor]
+    ) -> Tensor:
         """Product of the whitened Jacobian with images of all frames, which are whitened here.
 
         The Jacobian by optics and wavefront includes the star and `sources`, (k, 3) by frame.
         """
-        objective, unknowns = self._objective, self._state.unknowns
+        unknowns = self._state.unknowns
         total = torch.zeros(unknowns.size, dtype=torch.float64)
         whitened = self._noise.inverse(images)
-        for k, (forward, point) in enumerate(
-            zip(objective.forwards, self._state.points, strict=True)
-        ):
-            # `inverse` has C^-1 x over w. Levels and companions have images in `_levels`, and the
+        for k, point in enumerate(frames.points):
+            # `inverse` has C^-1 x over w. Levels and companions have images in `levels`, and the
             # derivatives by the other unknowns come from reverse mode.
             pixels = self._noise.weight[k] * whitened[k]
-            where, levels = point.unknowns.slices, self._levels[k]
+            where, levels = point.unknowns.slices, frames.levels[k]
             of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
             last = where["companions"].stop
             of_frame[last - len(levels) : last] = levels.flatten(1) @ pixels.cpu().flatten()
-            for name, slopes in forward.slopes(point, pixels, sources[k]).items():
-                of_frame[where[name]] = slopes
+            slopes = frames.forwards[k].slopes(point, pixels, sources[k])
+            for name, slope in slopes.items():
+                of_frame[where[name]] = slope
             total += unknowns.rows[k].onto_unknowns(of_frame, unknowns.size)
         return total
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from pyklip_diffrender.linear.response import (
     NANOMETRE,
     Reading,
     ResponseCache,
+    at_half_the_wavelengths,
     coarse_copy,
     downsample,
 )
@@ -264,6 +266,13 @@ class Forward:
         self.basis, self.responses = responses.basis, responses
         self.coarse = coarse_copy(problem.model, responses.npix)
         self._starting_opd = problem.starting_opd(self.model.npix)
+
+    @cached_property
+    def at_half_the_wavelengths(self) -> Forward:
+        """The same frame, rendered at half as many wavelengths."""
+        other = copy.copy(self)
+        other.model = at_half_the_wavelengths(self.model)
+        return other
 
     def opd(self, unknowns: FrameUnknowns, vector: Tensor) -> Tensor:
         """Return the wavefront, (npix, npix), m; complex if the pupil's amplitude is free."""
