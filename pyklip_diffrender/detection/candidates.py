@@ -472,7 +472,7 @@ def _offset_products(templates: Templates, k: int, offset: Tensor) -> tuple[Tens
     frame = linear.frames[k]
     model = coarse_copy(fitted.model)
     # Shifts hardly depend on the wavelength.
-    model = model.at_wavelengths(model.bandpass.thinned(1)[1])
+    model = model.at_wavelengths(model.bandpass.thinned(1))
     opd = downsample(torch.from_numpy(fitted.opd.copy()), model.npix)
     grid = PupilGrid.full(model.npix, model.diameter)
     names = [linear.unknowns[unknown].name for unknown in frame.rows[: frame.first_mode].tolist()]

@@ -241,7 +241,7 @@ def _few_wavelengths(model: OpticalSystem) -> Bandpass:
     """As few wavelengths as the templates of a map need."""
     bandpass = model.bandpass
     if "bandpass" not in model.adjustable:
-        return bandpass.thinned(_MOST_TEMPLATE_WAVELENGTHS)[1]
+        return bandpass.thinned(_MOST_TEMPLATE_WAVELENGTHS)
     return bandpass.condensed(max(2, math.ceil(bandpass.width / _BAND_PER_WAVELENGTH)))
 
 

@@ -336,14 +336,19 @@ def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     return model.with_fidelity(**{k: v for k, v in coarser.items() if k in model.adjustable})
 
 
+def at_few_wavelengths(model: OpticalSystem, count: int) -> OpticalSystem:
+    """Return a copy of a model for derivatives, with at most `count` wavelengths.
+
+    Where planes are known at the model's wavelengths only, these are the model's own.
+    """
+    bandpass = model.bandpass
+    is_free = "bandpass" in model.adjustable
+    return model.at_wavelengths(bandpass.condensed(count) if is_free else bandpass.thinned(count))
+
+
 def at_half_the_wavelengths(model: OpticalSystem) -> OpticalSystem:
     """Return a copy of a model for derivatives, with half as many wavelengths."""
-    bandpass = model.bandpass
-    count = math.ceil(len(bandpass.wavelengths) / 2)
-    fewer = bandpass.condensed(count)
-    if "bandpass" not in model.adjustable:
-        _, fewer = bandpass.thinned(count)
-    return model.at_wavelengths(fewer)
+    return at_few_wavelengths(model, math.ceil(len(model.bandpass.wavelengths) / 2))
 
 
 def _field(model: OpticalSystem) -> float:
@@ -397,12 +402,11 @@ class WavefrontResponse:
         # the wavefront changes the field by a large factor, but hardly changes the derivative of
         # the field. This derivative is therefore stored, and the derivative of the image is
         # computed from it and from the current field of the star.
-        self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
-        self.coarse = coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
+        self.coarse = coarse = coarse_copy(at_few_wavelengths(model, wavelengths), npix)
         self._progress = progress
         self._fields: list[Tensor] | None = None
         pixels = math.prod(model.detector.shape) * model.detector.oversample**2
-        self.size = 8 * len(basis) * pixels * len(bandpass.wavelengths)
+        self.size = 8 * len(basis) * pixels * len(coarse.bandpass.wavelengths)
         """Size of the stored derivatives, bytes."""
         # Behind the occulter, arrays are padded to twice the size of the image.
         samples = max(math.prod(coarse.entrance.grid.shape), 4 * pixels)
@@ -465,7 +469,7 @@ class WavefrontResponse:
         amplitude_modes: int = 0,
         modes: int | None = None,
     ) -> Tensor:
-        """Derivatives of the image by modes, for fields of the star from `OpticalSystem.fields`.
+        """Derivatives of the image by modes, for fields of the star at few wavelengths.
 
         The result is (modes + amplitude_modes, ny, nx), float32, light per pixel (fraction of the
         light that the pupil collects) per nm. The first `modes` rows are for the leading wavefront
@@ -479,7 +483,7 @@ class WavefrontResponse:
         images = torch.empty(modes + amplitude_modes, *detector.shape, device=self.model.device)
         conjugates = [
             (2 * weight) * field.to(torch.complex64).conj()
-            for field, weight in zip(self._kept(fields), self.coarse.bandpass.weights, strict=True)
+            for field, weight in zip(fields, self.coarse.bandpass.weights, strict=True)
         ]
         for places, changes in self._batches(count):
             total = _weighted_sum(changes, conjugates)
@@ -490,10 +494,6 @@ class WavefrontResponse:
                 elif wanted.any():
                     rows[places[wanted]] = detector.image(parts[wanted], values)
         return images
-
-    def _kept(self, fields: Sequence[Tensor]) -> list[Tensor]:
-        """The star's fields at the wavelengths of the response."""
-        return [fields[k] for k in self._kept_wavelengths]
 
 
 def _weighted_sum(changes: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
@@ -573,8 +573,8 @@ class Reading:
     ) -> Tensor:
         """Take the derivatives by named parameters, (components, ny, nx).
 
-        `opd` is (npix, npix) on the model's grid, m, and `fields` are the fields of the star at
-        each wavelength. The names must not change between calls.
+        `opd` is (npix, npix) on the model's grid, m, and `fields` are the fields of the star by the
+        cache's model `few`. The names must not change between calls.
         """
         slopes, error = self._cache.slopes_within(opd, values, names, self._allowed, self._keep)
         self.farthest = max(self.farthest, error)
@@ -603,8 +603,9 @@ class ResponseCache:
         self.memory, self.progress = memory, progress
         self._kept: list[tuple[_About, WavefrontResponse]] = []
         self._slopes: list[tuple[_About, dict[str, list[Tensor]]]] = []
-        self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
-        self._coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
+        self.few = at_few_wavelengths(model, wavelengths)
+        """The model at the wavelengths of the derivatives, which gives the field of the star."""
+        self._coarse = coarse_copy(self.few, npix)
         self._last_pupil = LastPupil(self._coarse)
 
     def image_slopes(
@@ -615,8 +616,7 @@ class ResponseCache:
         slopes: dict[str, list[Tensor]],
     ) -> Tensor:
         """Derivatives of the image, (components, ny, nx), from derivatives of the field."""
-        own = [fields[k] for k in self._kept_wavelengths]
-        return image_derivatives(self._coarse, own, values, names, slopes)
+        return image_derivatives(self._coarse, fields, values, names, slopes)
 
     def slopes_within(
         self,

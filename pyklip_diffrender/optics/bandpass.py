@@ -40,15 +40,15 @@ class Bandpass:
         shares = np.ones(len(waves)) if weights is None else native_float64(weights)
         return cls(tuple(waves.tolist()), tuple(np.atleast_1d(shares).tolist()))
 
-    def thinned(self, count: int) -> tuple[tuple[int, ...], Bandpass]:
-        """Indices of `count` wavelengths, evenly spread, and their bandpass with all weights."""
+    def thinned(self, count: int) -> Bandpass:
+        """A bandpass with `count` of these wavelengths, evenly spread, that have all weights."""
         total = len(self.wavelengths)
         if count >= total:
-            return tuple(range(total)), self
+            return self
         order = np.argsort(self.wavelengths)
         if count == 1:
             middle = int(np.abs(np.array(self.wavelengths) - self.mean_wavelength).argmin())
-            return (middle,), Bandpass((self.wavelengths[middle],), (1.0,))
+            return Bandpass((self.wavelengths[middle],), (1.0,))
         indices = np.sort(order[np.round(np.linspace(0, total - 1, count)).astype(int)])
         nodes = np.array(self.wavelengths)[indices]
         ascending = np.argsort(nodes)
@@ -58,7 +58,7 @@ class Bandpass:
             np.interp(self.wavelengths, nodes[ascending], unit[ascending]) for unit in np.eye(count)
         ]
         weights = np.array(shares) @ np.array(self.weights)
-        return tuple(indices.tolist()), Bandpass(tuple(nodes.tolist()), tuple(weights.tolist()))
+        return Bandpass(tuple(nodes.tolist()), tuple(weights.tolist()))
 
     def condensed(self, count: int) -> Bandpass:
         """A bandpass with the `count` nodes of a Gauss quadrature as wavelengths.

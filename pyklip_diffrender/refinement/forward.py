@@ -355,21 +355,25 @@ class Forward:
         first = unknowns.where("companions").stop - len(levels)
         rows[first : first + len(levels)] = levels
         rows[:first], rows[unknowns.where("companions").stop :] = 0.0, 0.0
-        for light in self._lights(point, bright):
+        for light in self._lights(point, bright, self.responses.few):
             self._add_slopes(rows, point, *light, modes, reading)
         return rows
 
     def _lights(
-        self, point: Point, companions: Tensor
+        self, point: Point, companions: Tensor, model: OpticalSystem
     ) -> Iterator[tuple[list[Tensor], dict[str, Tensor], Tensor]]:
-        """Fields, parameters, and level of the star and of companions (k, 3)."""
+        """Fields by a model, parameters, and level of the star and of companions (k, 3)."""
         unknowns, vector = point.unknowns, point.vector
         values, flux = unknowns.values(vector), unknowns.level("flux", vector)
-        yield point.fields, values, flux * self.problem.gain
+        with torch.no_grad():
+            fields = point.fields
+            if model is not self.model:
+                fields = model.fields(point.opd, **values)
+        yield fields, values, flux * self.problem.gain
         for source in companions:
             towards = self._towards(values, unknowns.turn @ source[1:])
             with torch.no_grad():
-                fields = self.model.fields(point.opd, **towards)
+                fields = model.fields(point.opd, **towards)
             yield fields, towards, flux * source[0] * torch.ones_like(self.problem.gain)
 
     def _add_slopes(
@@ -442,7 +446,7 @@ class Forward:
         # The derivatives take as long as two or three images, by reverse mode at one wavelength
         # after the other. `jacobian` uses a coarse copy at fewer wavelengths, with an error that
         # exceeds a gradient near its zero, and without the light of faint companions.
-        lights = self._lights(point, companions)
+        lights = self._lights(point, companions, self.model)
         totals = [
             torch.stack(parts).sum(dim=0)
             for parts in zip(
