@@ -260,33 +260,37 @@ class Solver:
 
     def _accurate_step(self, state: State, carried: StepState, kappa: float, modes: int) -> Step:
         """Take a step, or a part of it, with derivatives of the model itself."""
-        objective = self.objective
+        objective, tolerance = self.objective, self.settings.tolerance
         noise = objective.errors(state, kappa, objective.robust)
-        before = self._cost(state, noise, carried.priors)
-        offset = state.vector - state.unknowns.initial()
-        deviation = self.prior_deviation(state.unknowns, carried.priors)
-        enough = self.settings.tolerance * objective.pixels / 2
+        first = before = self._cost(state, noise, carried.priors)
+        enough = tolerance * objective.pixels / 2
         # Equations of an earlier state precondition nearly as well, and new ones take longer than
-        # the step itself.
+        # the step itself. But only new ones tell that no further step gains anything: along the
+        # directions that the earlier ones do not see, a step is too short.
         for is_new in (False, True):
             equations = None if is_new else self.equations.preconditioner(state, kappa, modes)
             if equations is None:
                 equations = self.equations.about(state, kappa, modes, objective.robust, ACCURATE)
+            is_last = equations.state is state
             derivatives = ModelDerivatives(objective, state, noise)
             volume = self._volume_gradient(state, carried.priors, len(equations.curvature))
+            offset = state.vector - state.unknowns.initial()
+            deviation = self.prior_deviation(state.unknowns, carried.priors)
             step, settled = accurate_step(
                 derivatives, equations.curvature, offset, deviation, enough, volume=volume
             )
+            del equations  # The next ones are as large.
             self.equations.judge(preconditions=settled)
             for part in _STEP_PARTS:
                 trial = self._moved(state, part * step)
                 after = self._cost(trial, noise, carried.priors)
                 if after < before and trial.has_star:
-                    return Step(trial, (before - after) / objective.pixels, carried)
-            if equations.state is state:
+                    state, before = trial, after
+                    break
+            gain = (first - before) / objective.pixels
+            if is_last or gain >= tolerance:
                 break
-            del equations  # The next ones are as large.
-        return Step(state, 0.0, carried)
+        return Step(state, gain, carried)
 
     def _moved(self, state: State, step: Tensor) -> State:
         """The state after a step of the leading unknowns, within the bounds of all parameters."""
