@@ -260,18 +260,21 @@ class Solver:
 
     def _accurate_step(self, state: State, carried: StepState, kappa: float, modes: int) -> Step:
         """Take a step, or a part of it, with derivatives of the model itself."""
-        objective, tolerance = self.objective, self.settings.tolerance
+        objective = self.objective
         noise = objective.errors(state, kappa, objective.robust)
         first = before = self._cost(state, noise, carried.priors)
-        enough = tolerance * objective.pixels / 2
+        enough = self.settings.tolerance * objective.pixels / 2
         # Equations of an earlier state precondition nearly as well, and new ones take longer than
         # the step itself. But only new ones tell that no further step gains anything: along the
-        # directions that the earlier ones do not see, a step is too short.
-        for is_new in (False, True):
-            equations = None if is_new else self.equations.preconditioner(state, kappa, modes)
+        # directions that the earlier ones do not see, a step is too short. Before the flux is
+        # marginal, other steps follow.
+        followed = self.settings.marginal_flux and not carried.priors.determined
+        sufficient = 0.0 if followed else self.settings.tolerance
+        for attempt in range(2):
+            equations = None if attempt else self.equations.preconditioner(state, kappa, modes)
             if equations is None:
                 equations = self.equations.about(state, kappa, modes, objective.robust, ACCURATE)
-            is_last = equations.state is state
+            is_new = equations.state is state
             derivatives = ModelDerivatives(objective, state, noise)
             volume = self._volume_gradient(state, carried.priors, len(equations.curvature))
             offset = state.vector - state.unknowns.initial()
@@ -288,7 +291,7 @@ class Solver:
                     state, before = trial, after
                     break
             gain = (first - before) / objective.pixels
-            if is_last or gain >= tolerance:
+            if is_new or gain > sufficient:
                 break
         return Step(state, gain, carried)
 
