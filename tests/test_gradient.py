@@ -234,6 +234,30 @@ def test_the_last_step_is_an_accurate_one():
     assert last.gain < quick.gain
 
 
+def test_a_step_that_gains_little_with_earlier_derivatives_is_not_the_last():
+    """Earlier ones may not see the direction in which the most is to gain."""
+    solver, state = solver_of.__wrapped__(1, accurate_steps=True)  # Its settings change.
+    carried = StepState(solver.priors_of(solver.settings))
+
+    def step(tolerance):
+        other = solver.objective.at(state.unknowns, 1.01 * state.vector)
+        equations = solver.equations.about(other, 0.01, len(BASIS), 4.0, 0.05)
+        stiff = 1e12 * equations.curvature.diagonal()
+        stiff[state.unknowns.where("background")] = 0.0
+        curvature = equations.curvature + torch.diag(stiff)
+        solver.equations.last = replace(equations, curvature=curvature)
+        solver.settings = replace(solver.settings, tolerance=tolerance)
+        return solver._accurate_step(state, carried, 0.01, len(BASIS))
+
+    gain = step(1e-12).gain
+    assert gain > 0
+    taken = step(2 * gain)
+    assert taken.gain > 1.3 * gain
+    noise = solver.objective.errors(state, 0.01, solver.objective.robust)
+    before, after = (solver._cost(each, noise, carried.priors) for each in (state, taken.state))
+    assert (before - after) / solver.objective.pixels == pytest.approx(taken.gain)
+
+
 def test_a_marginal_flux_counts_the_volume_of_the_wavefront():
     """The penalty is n log F, which steps know, so that the star is fainter."""
     solver, state = solver_of(2)

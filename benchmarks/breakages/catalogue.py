@@ -176,6 +176,10 @@ def _rules_of_a_fit() -> list[Breakage]:
             "is_last = False", "gradient",
         ),
         Breakage(
+            "rule-new-derivatives", "derivatives of an earlier state do not end a fit",
+            "if is_new or gain > sufficient:", "if is_new or gain > 0:", "gradient",
+        ),
+        Breakage(
             "rule-wider-prior", "a prior that is too narrow is widened",
             "        if not priors.are_improbable(ratios):\n            return settings\n",
             "        if True:\n            return settings\n", "detection",
