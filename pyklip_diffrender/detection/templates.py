@@ -186,7 +186,7 @@ class Templates:
                 self._rendered.clear()
             # Central differences: a fast path renders single stars, but only without forward-mode
             # derivatives, which take three times as long as four more images. Half of the
-            # wavelengths change these images by 0.4 % in W filters.
+            # wavelengths change these images by 0.4 % in F444W, and by 4 % in F322W2.
             parts, fewer = [self._light(k, offset)], at_half_the_wavelengths(self.frames[k].model)
             for step in _SHIFT_ARCSEC * torch.eye(2, dtype=torch.float64):
                 ahead, behind = (self._light(k, offset + by, fewer) for by in (step, -step))

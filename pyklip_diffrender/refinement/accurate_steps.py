@@ -81,6 +81,15 @@ class ModelDerivatives:
         ]
         return _Frames.of(forwards, points)
 
+    @cached_property
+    def _faint_light(self) -> list[Tensor]:
+        """Light of the faint companions in each frame, (ny, nx)."""
+        frames = zip(self._cheaper.forwards, self._cheaper.points, strict=True)
+        return [
+            forward.at(point.unknowns, point.vector).total - point.total
+            for forward, point in frames
+        ]
+
     def product(self, step: Tensor) -> Tensor:
         """Product of the curvature with a step, (unknowns,)."""
         # A s = J C^-1 (J^T s): a difference of two images along the step s has J^T s, and `_pull`
@@ -103,7 +112,7 @@ class ModelDerivatives:
         of_companions = step[unknowns.where("companions")]
         rows = frames.levels[k][-len(of_companions) :].unflatten(0, (-1, 3))[faint].flatten(0, 1)
         change = torch.tensordot(of_companions.reshape(-1, 3)[faint].flatten(), rows, dims=1)
-        light = frames.forwards[k].at(unknowns, point.vector).total - point.total
+        light = self._faint_light[k]
         change_of_flux = unknowns.level("flux", step) if "flux" in unknowns.linear else 0.0
         relative = change_of_flux / unknowns.level("flux", point.vector)
         return relative * light + change.to(light.device)

@@ -269,7 +269,7 @@ class Forward:
 
     @cached_property
     def at_half_the_wavelengths(self) -> Forward:
-        """The same frame, rendered at half as many wavelengths."""
+        """Forward model of this frame at half as many wavelengths."""
         other = copy.copy(self)
         other.model = at_half_the_wavelengths(self.model)
         return other
