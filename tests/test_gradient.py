@@ -159,6 +159,24 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy():
     assert (coarse - expected).norm() > 0.1 * expected.norm()
 
 
+def test_the_curvature_along_the_flux_counts_faint_companions():
+    """All light of the frame is in proportion to the flux."""
+    solver, state = solver_of(1, nlambda=9)
+    companion = dr.Planet(9e-5, 0.4, 20.0)
+    state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
+    (point,) = state.points
+    assert not point.unknowns.are_bright(point.vector).any()
+    where = state.unknowns.where("flux")
+    step = torch.zeros(state.unknowns.size, dtype=torch.float64)
+    step[where] = 0.01 * state.vector[where]
+    noise = solver.objective.errors(state, 0.01, 4.0)
+    background = point.unknowns.level("background", point.vector)
+    light = 0.01 * (point.total - background)
+    expected = float((light * noise.weight[0] * noise.inverse({0: light})[0]).sum())
+    curved = float(step @ ModelDerivatives(solver.objective, state, noise).product(step))
+    assert curved == pytest.approx(expected, rel=1e-3)
+
+
 def with_errors(equations, errors):
     """Equations whose derivatives have other errors."""
     each = zip(equations.derivatives, errors, strict=True)
