@@ -44,6 +44,7 @@ from pyklip_diffrender.io.files import write_table
 from pyklip_diffrender.pattern import choice as patterns
 from pyklip_diffrender.reduction import summarise
 from pyklip_diffrender.reduction.klip import klip_curve, small_sample_factor
+from pyklip_diffrender.refinement import jansky_per_unit
 
 SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
 SIZE = 80
@@ -123,6 +124,7 @@ def reduce_case(
         "use": result.visit.in_words(),
         "status": result.fit.status.name,
         "chi2": round(result.fit.chi2_per_pixel, 3),
+        "star Jy": star_flux_density(result.fit),
         "S/N scatter": round(float(np.nanstd(snr)), 3),
         "S/N range": f"{np.nanmin(snr):.1f} to {np.nanmax(snr):.1f}",
         "candidates": " ".join(
@@ -159,6 +161,13 @@ def reduce_case(
     # With the derivatives, for `benchmarks.false_alarms`.
     result.fit.write(folder / "fit.fits", overwrite=True)
     (folder / "row.json").write_text(json.dumps(row))
+
+
+def star_flux_density(fit: dr.Refinement) -> float:
+    """Flux density of the star in Jy, which all of its frames share."""
+    scale = jansky_per_unit(fit.frames[0])
+    assert scale is not None, "the frames have no PIXAR_SR"
+    return float(f"{scale * fit.frames[0].flux:.4g}")
 
 
 def limits_of_pairs(rows: list[dict[str, Any]]) -> Table:
@@ -200,8 +209,8 @@ def limits_of_pairs(rows: list[dict[str, Any]]) -> Table:
 
 def print_tables(rows: list[dict[str, Any]]) -> None:
     """Print one row per case, the limits of the pairs, and their median and least ratios."""
-    short = ("star", "filter", "rolls", "library", "references", "status", "chi2", "S/N scatter",
-             "S/N range", "candidates", "CPU s", "GiB")  # fmt: skip
+    short = ("star", "filter", "rolls", "library", "references", "status", "chi2", "star Jy",
+             "S/N scatter", "S/N range", "candidates", "CPU s", "GiB")  # fmt: skip
     Table([{key: row[key] for key in short} for row in rows]).pprint_all()
     for row in rows:
         print(*(row[name] for name in GIVEN), row.get("injections", ""))
