@@ -34,8 +34,8 @@ import pyklip_diffrender as dr
 from benchmarks.provenance import provenance
 from pyklip_diffrender.detection import Detection, SkyMap
 from pyklip_diffrender.detection.field import separation_of
-from pyklip_diffrender.optics import PupilGrid
-from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 
 WAVELENGTHS = {"F444W": 4.4e-6, "F356W": 3.56e-6, "F300M": 3.0e-6}
 SETS = {

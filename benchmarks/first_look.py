@@ -21,7 +21,7 @@ from astropy.table import Table
 
 import pyklip_diffrender as dr
 from benchmarks.provenance import provenance
-from pyklip_diffrender.scene import ExposureSequence
+from pyklip_diffrender.scene.sequence import ExposureSequence
 
 Limits = dict[str, Any]
 

@@ -40,6 +40,7 @@ from benchmarks.speed.timing import exponent
 from pyklip_diffrender.io.files import write_table
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import equations
+from pyklip_diffrender.wavefront.opd import random_drift
 
 START: dict[str, float] = {"pixels": 80, "cycles": 12, "wavelengths": 4, "frames": 1}
 SIZES: dict[str, tuple[float, ...]] = {
@@ -124,7 +125,7 @@ def measured(pixels: float, cycles: float, wavelengths: float, frames: float) ->
         "F444W", npix=PUPIL_SAMPLES, fov_pixels=int(pixels), nlambda=int(wavelengths)
     )
     start = dr.wavefront.random_opd(1, npix=PUPIL_SAMPLES)
-    drift = dr.wavefront.random_drift(2, DRIFT_HOURS, npix=PUPIL_SAMPLES)
+    drift = random_drift(2, DRIFT_HOURS, npix=PUPIL_SAMPLES)
     now = replace(start, data=start.data + drift.data)
     observed = [dr.simulate(model, dr.Scene(), now, seed=k) for k in range(int(frames))]
     settings = dr.FitSettings(

@@ -12,9 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.optics import Bandpass, OpticalSystem, PupilGrid
-from pyklip_diffrender.wavefront import SegmentMotions, random_opd
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics import Bandpass, OpticalSystem
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.wavefront import random_opd
+from pyklip_diffrender.wavefront.bases import SegmentMotions
 
 DTYPES = (torch.float64, torch.float32)
 WAVELENGTH = 4.5e-6

@@ -6,8 +6,9 @@ import numpy as np
 import torch
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.optics import PupilGrid
-from pyklip_diffrender.wavefront import JointBasis, random_opd
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.wavefront import random_opd
+from pyklip_diffrender.wavefront.bases import JointBasis
 
 READ_NOISE = 42.0
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from benchmarks.stpsf_data import nircam
 from pyklip_diffrender.bridges import from_webbpsf
-from pyklip_diffrender.instrument import FLIGHT_ALIGNMENT, nircam_coronagraph
+from pyklip_diffrender.instrument import FLIGHT_ALIGNMENT
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 
 CALL = {"monochromatic": 4.5e-6, "fft_oversample": 4, "detector_oversample": 2, "fov_pixels": 80}
 FULL = {"fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 80}

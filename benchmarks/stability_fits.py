@@ -16,9 +16,9 @@ import torch
 import pyklip_diffrender as dr
 from benchmarks import noisy_stars
 from benchmarks.hard_cases import WAVELENGTH, segment
-from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement import Refinement, Status
-from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 
 NPIX, SIZE = 64, 24
 FLUX, BACKGROUND = 1e11, 500.0

@@ -19,9 +19,12 @@ from benchmarks.hard_cases import (
     wavefront,
     worst,
 )
-from pyklip_diffrender.instrument import MASKS, NIRCAM_LW_PIXELSCALE, jwst_pupil, maskrnd_openings
-from pyklip_diffrender.optics import PupilGrid, polygon_coverage
-from pyklip_diffrender.scene import Planet, Scene, expected_photons, planet_photons, star_photons
+from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
+from pyklip_diffrender.instrument.masks import MASKS
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
+from pyklip_diffrender.scene.objects import Planet, Scene
+from pyklip_diffrender.scene.simulation import expected_photons, planet_photons, star_photons
 
 FLUX, READ_NOISE = 2.8e12, 42.0
 """Photons of the paper's star, and its read noise: they say how near to the truth is near."""

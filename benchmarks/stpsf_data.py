@@ -15,13 +15,9 @@ import torch
 from astropy.io import fits
 from astropy.table import Table
 
-from pyklip_diffrender.instrument import (
-    filter_throughput,
-    jwst_pupil,
-    jwst_segments,
-    maskrnd_openings,
-)
-from pyklip_diffrender.optics import JWST_DIAMETER, PupilGrid, polygon_coverage
+from pyklip_diffrender.instrument.jwst import jwst_pupil, jwst_segments, maskrnd_openings
+from pyklip_diffrender.instrument.spectrum import filter_throughput
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, polygon_coverage
 
 FILTERS = ("F200W", "F335M", "F444W")
 SENSORS = [str(number) for number in range(481, 491)]

@@ -48,10 +48,13 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
 from benchmarks.stpsf_data import nircam, stop_of
-from pyklip_diffrender.instrument import detector_place, filter_shift
-from pyklip_diffrender.optics import resample
+from pyklip_diffrender.instrument import detector_place
+from pyklip_diffrender.instrument.masks import filter_shift
+from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction.klip import klip_curve
-from pyklip_diffrender.scene import ExposureSequence, Planet
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.sequence import ExposureSequence
+from pyklip_diffrender.wavefront.opd import random_drift
 
 ROLLS = (70.0, 80.0)
 DRIFT, BETWEEN = 6e-9, 2e-9
@@ -224,7 +227,7 @@ def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0)
     drifted = opd + changed(int(seeds[0]), DRIFT, len(opd))
     if case.age is not None:
         hours = drift_in(case.age) / 9e-9 * 86  # It drifts by 9 nm in 86 hours.
-        drift = dr.wavefront.random_drift(int(seeds[0]), hours, npix=256).data
+        drift = random_drift(int(seeds[0]), hours, npix=256).data
         drifted = drifted + np.asarray(resample(drift, len(opd)))
     for k, (roll, star) in enumerate(zip(ROLLS, STARS, strict=True), 1):
         now = drifted + changed(int(seeds[k]), BETWEEN, len(opd))

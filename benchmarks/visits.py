@@ -41,7 +41,8 @@ from benchmarks import stpsf_sequences as made
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.instrument import detector_place
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.scene import ExposureSequence, Planet
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.sequence import ExposureSequence
 
 NPIX = 512
 DITHERS = (*made.DITHERS, (0.0, 0.02), (0.02, 0.0), (0.0, -0.02), (-0.02, 0.0))

@@ -7,7 +7,8 @@ from pyklip.parallelized import klip_dataset
 
 from pyklip_diffrender.pyklip_backend import Fit, Subtraction
 from pyklip_diffrender.refinement import FitSettings
-from pyklip_diffrender.wavefront import as_opd_map, random_drift, random_opd
+from pyklip_diffrender.wavefront import random_opd
+from pyklip_diffrender.wavefront.opd import as_opd_map, random_drift
 
 SHAPE = (48, 44)
 CENTER = (21.25, 24.5)

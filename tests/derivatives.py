@@ -2,7 +2,7 @@
 
 import torch
 
-from pyklip_diffrender.linear import field_derivatives, image_derivatives
+from pyklip_diffrender.linear.response import field_derivatives, image_derivatives
 
 
 @torch.no_grad()

@@ -26,8 +26,9 @@ from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
 from pyklip_diffrender.reduction import SPECTRA, summarise
 from pyklip_diffrender.refinement.fit_file import text_of
 from pyklip_diffrender.refinement.settings import nircam_settings
-from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.scene.aligned_frames import mask_place
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import model_for
 
 SIDE, SIZE, NPIX = 97, 28, 64

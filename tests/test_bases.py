@@ -6,10 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from pyklip_diffrender.instrument import TABULATED_GAP, is_jwst_pupil, jwst_pupil, jwst_segments
-from pyklip_diffrender.optics import JWST_DIAMETER, PupilGrid, polygon_coverage, widen_polygon
-from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.bases import coefficients_of
+from pyklip_diffrender.instrument.jwst import (
+    TABULATED_GAP,
+    is_jwst_pupil,
+    jwst_pupil,
+    jwst_segments,
+)
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, polygon_coverage, widen_polygon
+from pyklip_diffrender.wavefront.bases import (
+    FourierModes,
+    JointBasis,
+    SegmentMotions,
+    coefficients_of,
+)
 
 GRID = PupilGrid.full(128)
 SEGMENTS = SegmentMotions()

@@ -14,7 +14,7 @@ from pyklip_diffrender.bridges import from_poppy, from_webbpsf
 from pyklip_diffrender.bridges.poppy import PoppySystem
 from pyklip_diffrender.bridges.webbpsf import WebbSystem
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics import InstrumentSystem, OpticalSystem
 
 # Of poppy's drawing, and of stpsf's writing.

@@ -14,9 +14,9 @@ from benchmarks import stpsf_data
 from benchmarks.stpsf_data import lopsided, pupil, zernike_tensor
 from pyklip_diffrender import errors
 from pyklip_diffrender.bridges import from_webbpsf, opd_to_webbpsf
-from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.optics import JWST_DIAMETER, OpticalSystem, PupilGrid
-from pyklip_diffrender.optics.grid import zernike_basis
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, zernike_basis
 
 NPIX = 256
 FAST = {"monochromatic": 4.5e-6, "fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 60}

@@ -16,8 +16,8 @@ from pyklip_diffrender.errors import (
     MissingOPDError,
     UnitError,
 )
-from pyklip_diffrender.optics import resample
-from pyklip_diffrender.wavefront import read_opd
+from pyklip_diffrender.optics.grid import resample
+from pyklip_diffrender.wavefront.opd import read_opd
 
 NPIX = 256
 FIRST, SECOND = (f"R2022081102-NRCA3_FP1-{k}.fits" for k in (1, 2))

@@ -16,7 +16,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import separation_of
 from pyklip_diffrender.detection.search import side_lobes
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid
 
 FOUND = Candidates.at([[0.6, 0.3]], [3e-4])
 

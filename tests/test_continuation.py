@@ -10,10 +10,12 @@ import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement import FitSettings, Status, refine_again
-from pyklip_diffrender.scene import Observation, Planet
-from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior, default_basis, random_opd
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront import WavefrontPrior, random_opd
+from pyklip_diffrender.wavefront.bases import FourierModes, default_basis
 
 NPIX, SIZE, FLUX, READ_NOISE = 128, 24, 2e9, 42.0
 OFFSET = (0.002, -0.001)

@@ -16,7 +16,8 @@ from pyklip_diffrender.demo import DITHERS, draw_demo, run_demo, simulate_refere
 from pyklip_diffrender.detection import metrics
 from pyklip_diffrender.drawing import save
 from pyklip_diffrender.io import open_fits
-from pyklip_diffrender.scene import ALPHA_PICTORIS_W2, star_photons
+from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2
+from pyklip_diffrender.scene.simulation import star_photons
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = sorted(

@@ -23,11 +23,12 @@ from pyklip_diffrender.detection.candidates import with_companions
 from pyklip_diffrender.detection.error_factor import ErrorFactor, Significance
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.linear.model import Unknown
-from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement import Status, annealing, fitting, refine_again
 from pyklip_diffrender.refinement.annealing import Annealing
-from pyklip_diffrender.scene import Planet, world_coordinates
-from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.product_headers import world_coordinates
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 FLUX = 3e11

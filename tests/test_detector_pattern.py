@@ -17,9 +17,10 @@ from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.pattern import measure
 from pyklip_diffrender.refinement import Status, refine_again
-from pyklip_diffrender.scene import DetectorPattern, Observation, Planet
-from pyklip_diffrender.scene.detector_pattern import require_pattern_of
-from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern, require_pattern_of
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 
 NPIX, SIZE = 64, 32
 BASIS = JointBasis([SegmentMotions(), FourierModes(4)])

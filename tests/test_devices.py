@@ -11,17 +11,19 @@ from derivatives import parameter_jacobian
 from pretend_device import DEVICE, pretended
 
 import pyklip_diffrender as dr
-from pyklip_diffrender import optics
 from pyklip_diffrender.bridges import from_poppy
 from pyklip_diffrender.bridges.sampled_planes import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
-from pyklip_diffrender.linear import ResponseCache
-from pyklip_diffrender.linear.response import Reading
+from pyklip_diffrender.linear.response import Reading, ResponseCache
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.planes import GaussianBlur, LinearResampling, PixelCrosstalk
+from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.refinement import FitSettings, Refinement
 from pyklip_diffrender.refinement.forward import Problem
 from pyklip_diffrender.refinement.solver import Solver
-from pyklip_diffrender.scene import DetectorPattern
-from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
+from pyklip_diffrender.wavefront import WavefrontPrior
+from pyklip_diffrender.wavefront.bases import FourierModes
 
 NPIX, SIZE = 64, 24
 BASIS = FourierModes(2)
@@ -51,7 +53,7 @@ def tensors(model):
 def frame(k=0, *planets, **details):
     """A star through a drifted wavefront, rolled by 20 degrees a frame."""
     scene = dr.Scene(dr.Star(exposure=200.0), planets=planets)
-    grid = optics.PupilGrid.full(NPIX)
+    grid = PupilGrid.full(NPIX)
     drifted = opd() + BASIS.opd(3e-9 * torch.linspace(-1, 1, len(BASIS)), grid).numpy()
     seen = dr.simulate(model_on("cpu"), scene, drifted, seed=3 + k)
     return replace(seen, position_angles=np.full(len(seen), 20.0 * k), **details)
@@ -110,7 +112,7 @@ def parameter_derivatives(device, **changes):
 
 def point_sources(device, **changes):
     model = model_on(device, **changes)
-    sources = optics.PointSources(model, opd(), tensors(model), offset=(0.01, 0.0))
+    sources = PointSources(model, opd(), tensors(model), offset=(0.01, 0.0))
     return [sources.images([3, 12, 20], [12, 12, 4]).cpu().numpy()]
 
 
@@ -179,10 +181,10 @@ def test_every_plane_and_effect_of_the_detector():
         kernel = np.arange(1.0, 10.0).reshape(3, 3)
         rows, columns = np.mgrid[:NPIX, :NPIX]
         chain = (
-            optics.GaussianBlur(1.2),
+            GaussianBlur(1.2),
             SplineRotation(7.0, smooth.shape),
-            optics.PixelCrosstalk(kernel),
-            optics.LinearResampling(rows + 0.3, columns - 0.2, smooth.shape),
+            PixelCrosstalk(kernel),
+            LinearResampling(rows + 0.3, columns - 0.2, smooth.shape),
         )
         return [effect(smooth).cpu().numpy().ravel() for effect in chain]
 

@@ -35,7 +35,7 @@ OBJECTS = {
 }  # fmt: skip
 """Classes of variables that the documentation calls by these names."""
 
-PACKAGES = (dr, dr.detection, dr.linear, dr.pattern, dr.pyklip_backend, dr.scene, dr.wavefront)
+PACKAGES = (dr, dr.detection, dr.linear, dr.pattern, dr.pyklip_backend, dr.wavefront)
 CLASSES = {
     name: getattr(package, name)
     for package in PACKAGES

@@ -11,11 +11,12 @@ import pyklip_diffrender as dr
 from benchmarks.noisy_stars import READ_NOISE, observed
 from benchmarks.stpsf_data import lopsided
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf
-from pyklip_diffrender.instrument import maskrnd_openings
-from pyklip_diffrender.optics import PupilGrid, polygon_coverage
+from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.refinement import FitSettings, Status
-from pyklip_diffrender.scene import Observation, Planet
-from pyklip_diffrender.wavefront import FourierModes
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import FourierModes
 
 
 def check(model, before, later, images, planet, flux, seen, settings, seed=5):

@@ -17,11 +17,11 @@ from pyklip.parallelized import klip_dataset
 from pyklip_diffrender.detection import detect
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, register, unregister
 from pyklip_diffrender.refinement import FitSettings
-from pyklip_diffrender.scene import Planet
-from pyklip_diffrender.wavefront import default_basis
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.wavefront.bases import default_basis
 
 # Of pyKLIP's spline through the user's PSF.
 pytestmark = pytest.mark.filterwarnings("ignore:.*rank deficient:UserWarning")

@@ -7,8 +7,13 @@ import pytest
 import torch
 from astropy.io import fits
 
-from pyklip_diffrender.instrument import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.optics import JWST_DIAMETER, PupilGrid, polygon_coverage, transform_polygons
+from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
+from pyklip_diffrender.optics.grid import (
+    JWST_DIAMETER,
+    PupilGrid,
+    polygon_coverage,
+    transform_polygons,
+)
 
 
 def area(polygon):

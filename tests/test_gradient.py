@@ -8,14 +8,15 @@ import pytest
 import torch
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.refinement.accurate_steps import ModelDerivatives, conjugate_gradients
 from pyklip_diffrender.refinement.equations import EquationsCache
 from pyklip_diffrender.refinement.forward import Forward, FrameDerivatives, Problem, allowance
 from pyklip_diffrender.refinement.solver import Solver, StepState
-from pyklip_diffrender.scene import DetectorPattern
-from pyklip_diffrender.wavefront import WavefrontPrior, default_basis
+from pyklip_diffrender.scene.detector_pattern import DetectorPattern
+from pyklip_diffrender.wavefront import WavefrontPrior
+from pyklip_diffrender.wavefront.bases import default_basis
 
 NPIX, SIZE = 64, 32
 BASIS = default_basis(3.0)

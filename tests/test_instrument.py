@@ -11,6 +11,13 @@ from astropy.table import Table
 
 from pyklip_diffrender import instrument
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.instrument.masks import FILTERS, MASKS, filter_shift, is_short_wave
+from pyklip_diffrender.instrument.nircam import (
+    ChromaticAberration,
+    internal_wavefront_error,
+    nircam_coronagraph,
+)
+from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.wavefront import random_opd
 
 SMALL = {"npix": 128, "fov_pixels": 24}
@@ -27,15 +34,15 @@ def opd():
 )
 def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(mask, filter_name, opd):
     """Where half of a planet's light passes the mask, and beyond it, where all does."""
-    model = instrument.nircam_coronagraph(filter_name, image_mask=mask, nlambda=2, **SMALL)
-    clear = instrument.nircam_coronagraph(filter_name, image_mask=None, nlambda=2, **SMALL)
+    model = nircam_coronagraph(filter_name, image_mask=mask, nlambda=2, **SMALL)
+    clear = nircam_coronagraph(filter_name, image_mask=None, nlambda=2, **SMALL)
     assert model.between[0].name == mask
     scale = instrument.detector_place(mask, filter_name).pixelscale
     assert model.detector.pixelscale == (scale, scale)
     unocculted = float(clear(opd).sum())
     assert float(model(opd).sum()) < 0.03 * unocculted
-    half = float(model(opd, (1.3 / instrument.MASKS[mask].sigma * 1.616, 0.0)).sum())
-    outside = (1.02 * instrument.MASKS[mask].radius, 0.0)
+    half = float(model(opd, (1.3 / MASKS[mask].sigma * 1.616, 0.0)).sum())
+    outside = (1.02 * MASKS[mask].radius, 0.0)
     beyond = float(model(opd, outside).sum() / clear(opd, outside).sum())
     assert half < 0.8 * unocculted
     assert beyond == pytest.approx(1.0, abs=0.02)
@@ -43,7 +50,7 @@ def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(mask, filter_nam
 
 def test_another_mask_brings_its_own_aberrations():
     masks = ("MASK210R", "MASK335R", "MASK430R")
-    wavefront = instrument.internal_wavefront_error
+    wavefront = internal_wavefront_error
     tables = {mask: wavefront(mask, short_wave=mask == "MASK210R") for mask in masks}
     rms = {mask: float(table[3:].norm() * 1e9) for mask, table in tables.items()}
     # The official table's column WFE_RMS, nm: of the lit part of the pupil, not of the circle.
@@ -56,12 +63,12 @@ def test_another_mask_brings_its_own_aberrations():
 
 def test_focus_is_zero_where_the_table_was_made_and_tilt_at_the_reference():
     """Elsewhere as by hand from stpsf's polynomials, nm: the focus of F444W is not negligible."""
-    long = instrument.ChromaticAberration(4.4e-6)
+    long = ChromaticAberration(4.4e-6)
     assert long(3.23e-6)[4] == 0
     assert long(4.4e-6)[3] == 0
     assert long(4.39e-6)[4] * 1e9 == pytest.approx(32.6, abs=0.05)
     assert (long(4.39e-6)[3] - long(3.35e-6)[3]) * 1e9 == pytest.approx(-233.4, abs=0.05)
-    short = instrument.ChromaticAberration(2.1e-6, short_wave=True)
+    short = ChromaticAberration(2.1e-6, short_wave=True)
     assert short(2.12e-6)[4] == 0
     assert short(2.0e-6)[4] * 1e9 == pytest.approx(-15.8, abs=0.05)
     assert short(2.0e-6)[3] * 1e9 == pytest.approx(-162.0, abs=0.05)
@@ -72,16 +79,16 @@ def test_places_on_the_detector_count_from_zero():
     place = instrument.detector_place("MASK335R", "F444W")
     assert place.detector == "NRCA5"
     assert np.subtract(place.center, (491, 1501)) == pytest.approx((149.2, 173.6))
-    assert instrument.filter_shift("F335M") == instrument.filter_shift("F210M") == (0.0, 0.0)
-    assert instrument.filter_shift("f444w") == (0.177, -0.205)
+    assert filter_shift("F335M") == filter_shift("F210M") == (0.0, 0.0)
+    assert filter_shift("f444w") == (0.177, -0.205)
 
 
 REFUSED = {
     r"'MASKA335R'.*MASK335R": partial(instrument.detector_place, "MASKA335R", "F444W"),
     r"'F150W'.*F182M.*F480M": partial(instrument.detector_place, "MASK335R", "F150W"),
-    r"F182M.*F480M, not for 'F277W'": partial(instrument.filter_shift, "F277W"),
+    r"F182M.*F480M, not for 'F277W'": partial(filter_shift, "F277W"),
     **{
-        message: partial(instrument.nircam_coronagraph, "F444W", **argument)
+        message: partial(nircam_coronagraph, "F444W", **argument)
         for message, argument in {
             "npix: got '128', expected a whole number": {"npix": "128"},
             r"npix: got 128\.5, expected a whole number": {"npix": 128.5},
@@ -99,11 +106,11 @@ def test_what_is_not_known_is_refused_with_what_is(complaint):
         REFUSED[complaint]()
 
 
-@pytest.mark.parametrize("name", instrument.FILTERS)
+@pytest.mark.parametrize("name", FILTERS)
 def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official_files, name):
     data = fits.getdata(official_files / "NIRCam" / "filters" / f"{name}_throughput.fits")
     truth = data["THROUGHPUT"] / data["THROUGHPUT"].max()
-    wavelength, throughput = instrument.filter_throughput(name)
+    wavelength, throughput = filter_throughput(name)
     # The ends are where the table, in units of 0.1 Angstrom, has been rounded.
     where = data["WAVELENGTH"] * 1e-10
     inside = (where >= wavelength[0] - 1e-11) & (where <= wavelength[-1] + 1e-11)
@@ -115,21 +122,21 @@ def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(official
 def test_aberrations_are_those_of_the_official_field_points(official_files):
     table = Table.read(official_files / "si_zernikes_coron_wfe.fits")
     places = [(r["instrument"].strip(), r["field_point_name"].strip()) for r in table]
-    for short_wave, mask in itertools.product((True, False), instrument.MASKS):
+    for short_wave, mask in itertools.product((True, False), MASKS):
         channel = f"NIRCam{'SW' if short_wave else 'LW'}A"
         row = table[places.index((channel, f"Z{mask[4:]}_A"))]
         truth = np.array([row[f"Zernike_{k}"] for k in range(1, 37)])
-        mine = instrument.internal_wavefront_error(mask, short_wave=short_wave)
+        mine = internal_wavefront_error(mask, short_wave=short_wave)
         np.testing.assert_allclose(mine, truth, rtol=1e-3, atol=1e-18)
 
 
 @pytest.mark.parametrize(
-    ("mask", "filter_name"), list(itertools.product(instrument.MASKS, ("F210M", "F444W")))
+    ("mask", "filter_name"), list(itertools.product(MASKS, ("F210M", "F444W")))
 )
 def test_pixels_and_places_are_those_of_the_siaf(mask, filter_name):
     pysiaf = pytest.importorskip("pysiaf")
     place = instrument.detector_place(mask, filter_name)
-    assert place.short_wave == instrument.is_short_wave(filter_name)
+    assert place.short_wave == is_short_wave(filter_name)
     along = "" if place.place == "-" else f"_{place.place}"
     siaf = pysiaf.Siaf("NIRCam")
     aperture = siaf[f"{place.detector}_FULL_{mask}{along}"]

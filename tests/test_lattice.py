@@ -6,8 +6,11 @@ import pytest
 import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.instrument import detector_place, nircam_coronagraph
-from pyklip_diffrender.optics import OpticalSystem, Plane, PointSources
+from pyklip_diffrender.instrument import detector_place
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.optics.planes import Plane
+from pyklip_diffrender.optics.point_sources import PointSources
 from pyklip_diffrender.wavefront import random_opd
 
 OPD = torch.from_numpy(random_opd(5, npix=128).data)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pyklip_diffrender.scene import calibrated_errors
+from pyklip_diffrender.scene.integrations import calibrated_errors
 
 SCALE = (0.063, 0.063)
 CENTER = np.array([[150.0, 150.0]])

@@ -15,19 +15,15 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.instrument import jwst_pupil, nircam_coronagraph
+from pyklip_diffrender.instrument.jwst import jwst_pupil
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io import sha256
-from pyklip_diffrender.optics import PupilGrid, resample
+from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.backend_settings import starting_opd
-from pyklip_diffrender.wavefront import (
-    SegmentMotions,
-    as_opd_map,
-    opd_for,
-    random_drift,
-    random_opd,
-    read_opd,
-)
+from pyklip_diffrender.wavefront import random_opd
+from pyklip_diffrender.wavefront.bases import SegmentMotions
+from pyklip_diffrender.wavefront.opd import as_opd_map, opd_for, random_drift, read_opd
 
 NPIX = 96
 PUPIL = jwst_pupil(NPIX).numpy() > 0.5

@@ -10,10 +10,13 @@ from astropy.time import Time
 from benchmarks.stpsf_data import wss_file
 from pyklip_diffrender import errors
 from pyklip_diffrender.io import sensing_date
-from pyklip_diffrender.optics import resample
+from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import ReduceOptions, prepare
-from pyklip_diffrender.scene import ExposureSequence, Observation
-from pyklip_diffrender.wavefront import choose_opd, interpolate_wss, opd_for, random_opd, read_opd
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import ExposureSequence
+from pyklip_diffrender.wavefront import random_opd
+from pyklip_diffrender.wavefront.opd import choose_opd, opd_for, read_opd
+from pyklip_diffrender.wavefront.wss import interpolate_wss
 
 NPIX = 64
 

@@ -8,16 +8,13 @@ import torch
 from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
-from pyklip_diffrender.instrument import (
-    FILTERS,
-    FLIGHT_ALIGNMENT,
-    MASKS,
-    filter_bandpass,
-    filter_throughput,
-    nircam_coronagraph,
-)
+from pyklip_diffrender.instrument import FLIGHT_ALIGNMENT
+from pyklip_diffrender.instrument.masks import FILTERS, MASKS
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.instrument.spectrum import filter_bandpass, filter_throughput
 from pyklip_diffrender.io import ARCSEC
-from pyklip_diffrender.optics import JWST_DIAMETER, Bandpass
+from pyklip_diffrender.optics import Bandpass
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
 from pyklip_diffrender.wavefront import random_opd
 

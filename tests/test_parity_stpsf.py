@@ -7,14 +7,13 @@ import torch
 from benchmarks.parity_cases import BARE, CALL, EMBEDDED, FULL, differences
 from benchmarks.stpsf_data import lyot_stop, nircam
 from pyklip_diffrender.bridges import from_webbpsf
-from pyklip_diffrender.instrument import (
-    MASKS,
-    BarMask,
-    detector_place,
-    maskrnd_openings,
-    nircam_coronagraph,
-)
-from pyklip_diffrender.optics import JWST_DIAMETER, LyotStop, OpticalSystem
+from pyklip_diffrender.instrument import detector_place
+from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.instrument.masks import MASKS, BarMask
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
+from pyklip_diffrender.optics.planes import LyotStop
 
 NPIX = 256
 SHORT = {"monochromatic": 2.0e-6}

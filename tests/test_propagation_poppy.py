@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks import poppy_reference as reference
-from pyklip_diffrender import instrument
-from pyklip_diffrender.optics import PupilGrid, polygon_coverage
+from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 
 NPIX = 128
 WAVELENGTH = 4.5e-6
@@ -19,7 +20,7 @@ def star(separation):
 
 
 def ours(occulter_sampling=None, route="auto"):
-    return instrument.nircam_coronagraph(
+    return nircam_coronagraph(
         monochromatic=WAVELENGTH,
         npix=NPIX,
         occulter_sampling=occulter_sampling,
@@ -31,10 +32,10 @@ def ours(occulter_sampling=None, route="auto"):
 
 def system(oversample):
     return reference.coronagraph(
-        instrument.jwst_pupil(NPIX).numpy(), reference.lopsided_opd(NPIX),
-        polygon_coverage(instrument.maskrnd_openings(), PupilGrid.full(NPIX)).numpy(),
+        jwst_pupil(NPIX).numpy(), reference.lopsided_opd(NPIX),
+        polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy(),
         reference.zernike_opd(reference.lopsided_zernikes(), NPIX), oversample=oversample,
-        fov_pixels=80, pixelscale=instrument.NIRCAM_LW_PIXELSCALE,
+        fov_pixels=80, pixelscale=NIRCAM_LW_PIXELSCALE,
     )  # fmt: skip
 
 

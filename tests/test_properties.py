@@ -7,9 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io import ARCSEC
-from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.wavefront import random_opd
 
 WAVELENGTH = 4.5e-6

@@ -10,7 +10,7 @@ from astropy import units as u
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.refinement.forward import Problem
-from pyklip_diffrender.wavefront import as_opd_map, random_drift
+from pyklip_diffrender.wavefront.opd import as_opd_map, random_drift
 
 OPD = dr.wavefront.random_opd(1, npix=64).data
 

@@ -13,11 +13,16 @@ import pyklip_diffrender as dr
 from benchmarks.noisy_stars import READ_NOISE, DriftedStar, drifted_star
 from pyklip_diffrender import errors
 from pyklip_diffrender.instrument.jwst import maskrnd_openings
-from pyklip_diffrender.optics import PupilGrid, polygon_coverage
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.refinement import FitSettings, Status, refine
 from pyklip_diffrender.refinement.fit_result import breakdown_explained
-from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions, random_opd
-from pyklip_diffrender.wavefront.bases import default_basis
+from pyklip_diffrender.wavefront import random_opd
+from pyklip_diffrender.wavefront.bases import (
+    FourierModes,
+    JointBasis,
+    SegmentMotions,
+    default_basis,
+)
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 NPIX = 128

@@ -8,26 +8,21 @@ import torch
 from derivatives import difference, parameter_jacobian
 from scipy.stats import multivariate_normal
 
-from pyklip_diffrender.instrument import nircam_coronagraph
-from pyklip_diffrender.linear import (
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.linear.response import (
     NANOMETRE,
     LastPupil,
+    Reading,
     ResponseCache,
     WavefrontResponse,
     coarse_copy,
     downsample,
 )
-from pyklip_diffrender.linear.response import Reading
-from pyklip_diffrender.optics import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.wavefront import (
-    FourierModes,
-    JointBasis,
-    SegmentMotions,
-    WavefrontPrior,
-    random_opd,
-    solve_with_evidence,
-)
+from pyklip_diffrender.wavefront import WavefrontPrior, random_opd
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.priors import solve_with_evidence
 
 NPIX = 256
 BASIS = JointBasis([SegmentMotions(), FourierModes(6)])

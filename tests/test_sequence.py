@@ -13,7 +13,10 @@ from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, N
 from pyklip_diffrender.io.headers import same_name
 from pyklip_diffrender.pattern import learn_pattern
 from pyklip_diffrender.refinement import FitSettings, Refinement, refine
-from pyklip_diffrender.scene import ExposureSequence, Observation, Scene, Star, simulate
+from pyklip_diffrender.scene.objects import Scene, Star
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import ExposureSequence
+from pyklip_diffrender.scene.simulation import simulate
 
 SIZE = 32
 SETTINGS = FitSettings(cycles=6)

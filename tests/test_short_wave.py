@@ -11,10 +11,15 @@ from astropy import units as u
 from astropy.io import fits
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.instrument import detector_place, filter_shift, nircam_coronagraph
+from pyklip_diffrender.instrument import detector_place
+from pyklip_diffrender.instrument.masks import filter_shift
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.reduction import reduce
 from pyklip_diffrender.refinement import FitSettings, refine, settings_for
-from pyklip_diffrender.scene import ExposureSequence, Observation, Planet, model_for
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import ExposureSequence
+from pyklip_diffrender.scene.simulation import model_for
 from pyklip_diffrender.wavefront import random_opd
 
 SIZE = 36

@@ -7,14 +7,10 @@ import pytest
 from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.refinement import FitSettings, refine
-from pyklip_diffrender.scene import (
-    ALPHA_PICTORIS_W2,
-    UNOCCULTED_PEAK,
-    Planet,
-    Scene,
-    Star,
+from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2, UNOCCULTED_PEAK, Planet, Scene, Star
+from pyklip_diffrender.scene.simulation import (
     expected_photons,
     planet_photons,
     simulate,

@@ -21,10 +21,12 @@ from pyklip_diffrender.detection.field import Positions, Sky
 from pyklip_diffrender.detection.measurement import candidate_table, measured_table
 from pyklip_diffrender.detection.published_limits import published_limits
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.instrument import FILTERS, detector_place
+from pyklip_diffrender.instrument import detector_place
+from pyklip_diffrender.instrument.masks import FILTERS
 from pyklip_diffrender.instrument.spectrum import vega_flux_density
 from pyklip_diffrender.refinement import jansky_per_unit, require_calibrated
-from pyklip_diffrender.scene import Observation, world_coordinates
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import world_coordinates
 
 # Of jw01184005001_03106_00001_nrcalong_calints.fits. The linear part of its WCS is the pipeline's,
 # made from the calibrated distortion; ROLL_REF and V3I_YANG are what this package reads.

@@ -19,7 +19,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Sky
 from pyklip_diffrender.detection.measurement import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import backend
 from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.spaceklip import database_files, run

@@ -14,7 +14,8 @@ from pyklip_diffrender.pattern import PatternLibrary, package_library
 from pyklip_diffrender.scene.admission import exposures_in
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.jobs import jobs_of
-from pyklip_diffrender.wavefront import choose_opd, random_opd
+from pyklip_diffrender.wavefront import random_opd
+from pyklip_diffrender.wavefront.opd import choose_opd
 
 SUFFIXES = (".fits", ".fit", ".fts", ".FITS", ".Fit", ".fits.gz", ".FITS.GZ", ".fit.gz", ".fits.fz")
 MARK = "\N{ZERO WIDTH NO-BREAK SPACE}"

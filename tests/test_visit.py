@@ -29,8 +29,9 @@ from pyklip_diffrender.reduction.visit import with_references
 from pyklip_diffrender.refinement import FitSettings, align_frame, join_frames, refine
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.settings import exposure_sequences
-from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.scene.exposure import CatalogueStar
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 SIZE, NPIX = 32, 64

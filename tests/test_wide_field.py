@@ -34,10 +34,10 @@ from pyklip_diffrender.pyklip_backend.fitted_star import FittedPointing
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.reduction.pictures import _stamps
 from pyklip_diffrender.reduction.pipeline import _Run, prepare
-from pyklip_diffrender.scene import ExposureSequence
 from pyklip_diffrender.scene.observation import Window
+from pyklip_diffrender.scene.sequence import ExposureSequence
 from pyklip_diffrender.scene.simulation import field_of, images_of_stars, within_field
-from pyklip_diffrender.wavefront import random_drift
+from pyklip_diffrender.wavefront.opd import random_drift
 
 
 def model(pixels=48):

@@ -18,9 +18,8 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor, compact_struct
 from pyklip_diffrender.detection.field import Image, pixel_width
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.linear import coarse_copy, downsample
 from pyklip_diffrender.linear.model import LinearFrame
-from pyklip_diffrender.linear.response import NANOMETRE
+from pyklip_diffrender.linear.response import NANOMETRE, coarse_copy, downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement import FrameFit, Refinement, refine_again, star_flux_error
 from pyklip_diffrender.refinement.settings import SAME_ROLL_DEG

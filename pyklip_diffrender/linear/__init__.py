@@ -3,25 +3,5 @@
 from __future__ import annotations
 
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.response import (
-    NANOMETRE,
-    LastPupil,
-    ResponseCache,
-    WavefrontResponse,
-    coarse_copy,
-    downsample,
-    field_derivatives,
-    image_derivatives,
-)
 
-__all__ = [
-    "NANOMETRE",
-    "LastPupil",
-    "LinearModel",
-    "ResponseCache",
-    "WavefrontResponse",
-    "coarse_copy",
-    "downsample",
-    "field_derivatives",
-    "image_derivatives",
-]
+__all__ = ["LinearModel"]

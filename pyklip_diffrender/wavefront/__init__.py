@@ -2,37 +2,8 @@
 
 from __future__ import annotations
 
-from pyklip_diffrender.wavefront.bases import (
-    FourierModes,
-    JointBasis,
-    SegmentMotions,
-    default_basis,
-)
-from pyklip_diffrender.wavefront.opd import (
-    as_opd_map,
-    choose_opd,
-    opd_for,
-    random_drift,
-    random_opd,
-    read_opd,
-)
+from pyklip_diffrender.wavefront.opd import random_opd
 from pyklip_diffrender.wavefront.opd_map import OPDMap
-from pyklip_diffrender.wavefront.priors import WavefrontPrior, solve_with_evidence
-from pyklip_diffrender.wavefront.wss import interpolate_wss
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = [
-    "FourierModes",
-    "JointBasis",
-    "OPDMap",
-    "SegmentMotions",
-    "WavefrontPrior",
-    "as_opd_map",
-    "choose_opd",
-    "default_basis",
-    "interpolate_wss",
-    "opd_for",
-    "random_drift",
-    "random_opd",
-    "read_opd",
-    "solve_with_evidence",
-]
+__all__ = ["OPDMap", "WavefrontPrior", "random_opd"]

@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from benchmarks.fuzz_intake import make_frames, run
 from pyklip_diffrender import errors
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError
-from pyklip_diffrender.scene import Observation
-from pyklip_diffrender.wavefront import OPDMap, random_opd, read_opd
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront import OPDMap, random_opd
+from pyklip_diffrender.wavefront.opd import read_opd
 
 pytestmark = pytest.mark.hard
 

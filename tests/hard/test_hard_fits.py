@@ -11,8 +11,9 @@ from benchmarks import stability_fits as hard
 from benchmarks.hard_cases import DTYPES, small, threads, wavefront
 from pyklip_diffrender import errors
 from pyklip_diffrender.refinement import Status
-from pyklip_diffrender.scene import Scene, simulate
-from pyklip_diffrender.wavefront import as_opd_map
+from pyklip_diffrender.scene.objects import Scene
+from pyklip_diffrender.scene.simulation import simulate
+from pyklip_diffrender.wavefront.opd import as_opd_map
 
 pytestmark = pytest.mark.hard
 

@@ -9,9 +9,11 @@ from benchmarks.hard_cases import DTYPES, WAVELENGTH, small, system, threads, wa
 from benchmarks.stability_optics import ROWS
 from pyklip_diffrender.bridges import image_masks as masks
 from pyklip_diffrender.io import ARCSEC
-from pyklip_diffrender.optics import JWST_DIAMETER, MatrixFourier, PupilGrid, Wavefront
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics.planes import MatrixFourier, Wavefront
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
-from pyklip_diffrender.scene import Planet, Scene, expected_photons, star_photons
+from pyklip_diffrender.scene.objects import Planet, Scene
+from pyklip_diffrender.scene.simulation import expected_photons, star_photons
 from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = pytest.mark.hard
