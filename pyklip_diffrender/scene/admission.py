@@ -148,16 +148,12 @@ def with_references(listed: list[FrameFile], marked: list[FrameFile]) -> list[Fr
 
 def _without_star(files: Iterable[FrameFile]) -> Reasons:
     """Files that cannot be frames of a star behind a mask, by their headers."""
-    return _with_reasons((each, _why_unusable(each.exposure)) for each in files)
+    return {each: reason for each in files if (reason := _why_unusable(each.exposure))}
 
 
 def with_odd_pixels(files: Iterable[FrameFile]) -> Reasons:
     """Read the pixels, and find files that cannot be frames of a star behind a mask."""
-    return _with_reasons((each, each.fault_of_pixels) for each in files)
-
-
-def _with_reasons(pairs: Iterable[tuple[FrameFile, str]]) -> Reasons:
-    return {file: reason for file, reason in pairs if reason}
+    return {each: each.fault_of_pixels for each in files if each.fault_of_pixels}
 
 
 def _why_unusable(exposure: Exposure) -> str:
@@ -542,12 +538,10 @@ def require_agreement(observations: Sequence[Observation]) -> None:
             )
     if len(observations) < 2:
         return
-    dated = [each for each in observations if each.date is not None]
-    days = [float(each.date.mjd) for each in dated if each.date is not None]
+    dated = [(each.name, each.date) for each in observations if each.date is not None]
+    days = [float(date.mjd) for _, date in dated]
     if days and max(days) - min(days) > EPOCH:
-        listed = ", ".join(
-            f"{each.name} ({each.date.isot[:10]})" for each in dated if each.date is not None
-        )
+        listed = ", ".join(f"{name} ({date.isot[:10]})" for name, date in dated)
         raise IncompatibleSetupError(
             f"observation: the wavefront of frames that are more than {EPOCH:g} days apart is not "
             f"the same: {listed}. Refine each epoch alone"

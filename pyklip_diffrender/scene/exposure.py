@@ -100,19 +100,15 @@ def identity_of(header: fits.Header, name: str) -> str | None:
     parts = [str(header.get(key, "")).strip() for key in _IDENTITY]
     if detector is not None and all(each and each.upper() != "UNKNOWN" for each in parts):
         digits = [part.zfill(n) for part, n in zip(parts, (5, 3, 3, 2, 1, 2, 5), strict=True)]
-        segment = header_number(header, "EXSEGNUM", name) or 1
-        return _identified(digits, f"{segment:03.0f}", detector)
-    for text in (header_text(header, "FILENAME", name) or "", Path(name).name):
-        match = _ARCHIVE_NAME.search(text)
-        if match:
-            *digits, part, chip = match.groups()
-            return _identified(digits, part or "001", chip)
-    return None
-
-
-def _identified(digits: list[str], segment: str, detector: str) -> str:
+        segment = f"{header_number(header, 'EXSEGNUM', name) or 1:03.0f}"
+    else:
+        texts = (header_text(header, "FILENAME", name) or "", Path(name).name)
+        match = next(filter(None, map(_ARCHIVE_NAME.search, texts)), None)
+        if match is None:
+            return None
+        *digits, segment, detector = match.groups()
     program, observation, visit, group, sequence, activity, exposure = digits
-    part = "" if segment == "001" else f"-seg{segment}"
+    part = "" if segment in (None, "001") else f"-seg{segment}"
     return (
         f"jw{program}{observation}{visit}_{group}{sequence}{activity}_{exposure}{part}_"
         f"{detector.lower()}"

@@ -16,7 +16,7 @@ from pyklip_diffrender.io.files import open_fits, product_in
 from pyklip_diffrender.io.headers import merged_header
 from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.integrations import why_odd_noise
-from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.observation import Observation, means_in
 from pyklip_diffrender.scene.pixel_checks import (
     not_judged,
     why_few_pixels,
@@ -65,7 +65,7 @@ class FrameFile:
                 file = cls.in_hdus(hdus, path)
                 if file.fault or not are_wanted(file.exposure):
                     return file
-                return replace(file, frames=_means(lambda: Observation.means_from_hdus(hdus, path)))
+                return replace(file, frames=_means(lambda: Observation(**means_in(hdus, path))))
         except DiffrenderError as error:
             return cls(path, Exposure(path.name), _without_name(error, path.name))
 

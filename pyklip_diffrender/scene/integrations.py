@@ -28,7 +28,6 @@ from pyklip_diffrender.io.units import (
     require_finite,
     require_shape,
     to_arcsec,
-    to_mask,
     to_pair,
     to_unit,
 )
@@ -36,36 +35,8 @@ from pyklip_diffrender.io.units import (
 # Checks of the arrays and numbers that an observation is made of.
 
 
-def checked_frames(
-    data: Any,
-    error: Any,
-    *,
-    valid: Any = None,
-    unit: str | u.UnitBase = "photon",
-    pixelscale: float | tuple[float, float],
-    center: Any = None,
-    **details: Any,
-) -> dict[str, Any]:
-    """Return the attributes of an `Observation`, checked, in its units, and copied.
-
-    For the arguments and the exceptions see `Observation.from_arrays`.
-    """
-    name = details.get("name", "observation")
-    unit = _unit(unit, name)
-    frames = checked_stacks(
-        to_unit(data, unit, f"{name}: data"),
-        to_unit(error, unit, f"{name}: error"),
-        valid=None if valid is None else to_mask(valid, f"{name}: valid"),
-        unit=unit,
-        pixelscale=pixelscale,
-        center=center,
-        **details,
-    )
-    mask_unusable(frames)
-    return frames
-
-
-def _unit(unit: Any, name: str) -> u.UnitBase:
+def unit_of_frames(unit: Any, name: str) -> u.UnitBase:
+    """Unit of an observation; UnitError if it is not known."""
     try:
         return u.Unit(unit)
     except (ValueError, TypeError) as reason:
@@ -109,7 +80,7 @@ def checked_stacks(
     `mask_unusable` sets what cannot be used to the values that an `Observation` has there.
     """
     name = details.get("name", "observation")
-    unit = _unit(unit, name)
+    unit = unit_of_frames(unit, name)
     values = data[None] if data.ndim == 2 else data
     if values.ndim != 3 or values.size == 0:
         raise ShapeError(f"{name}: data: got shape {np.shape(data)}, expected ([frames,] ny, nx)")
@@ -250,23 +221,25 @@ def empty_integrations(data: Stack, valid: Iterable[Mask]) -> Judgement:
     return Judgement(kept, tuple(remarks))
 
 
-def judge_integrations(
-    data: Stack,
-    error: Stack,
-    valid: Mask,
-    center: Stack,
-    pixelscale: tuple[float, float],
-    names: Sequence[str],
-    group: NDArray[np.intp] | None = None,
-) -> Judgement:
-    """Compare integrations of one pointing, (frames, ny, nx), with their median.
+def judge_integrations(frames: Mapping[str, Any], names: Sequence[str]) -> Judgement:
+    """Compare the integrations of every pointing with their median.
 
-    Pixels that deviate are masked in `valid`, in place. `center` is x, y of the star, (frames, 2),
-    in pixels, `pixelscale` x, y in arcsec per pixel, `names` call the integrations in remarks, such
-    as "integration 3 of 8", and `group` has the indices of the pointing's integrations.
+    `frames` are the attributes of an `Observation`. Pixels that deviate are masked in its valid
+    pixels, in place. `names` call the integrations in remarks, such as "integration 3 of 8".
     """
-    group = np.arange(len(data)) if group is None else group
-    kept = np.ones(len(data), dtype=bool)
+    kept = np.ones(len(frames["data"]), dtype=bool)
+    remarks: list[str] = []
+    for group in pointings(frames["center"], frames["position_angles"]):
+        remarks += _judge_pointing(frames, names, group, kept)
+    return Judgement(kept, tuple(remarks))
+
+
+def _judge_pointing(
+    frames: Mapping[str, Any], names: Sequence[str], group: NDArray[np.intp], kept: Mask
+) -> list[str]:
+    """Judge the integrations with the indices `group`; what is not used is not `kept`, in place."""
+    data, error, valid = frames["data"], frames["error"], frames["valid"]
+    pixelscale = frames["pixelscale"]
     remarks = []
     for k in group:
         if not valid[k].any():
@@ -278,14 +251,14 @@ def judge_integrations(
     group = group[kept[group]]
     # A single row or column has no slopes.
     if len(group) < _FEWEST_INTEGRATIONS or min(data.shape[1:]) < 2:
-        return Judgement(kept, tuple(remarks))
+        return remarks
     # The star may move by a twentieth of a pixel between integrations and its light change by 3 %.
     # Larger deviations that are significant are masked; an integration is left out if they are a
     # quarter of the pixels within 3 arcsec of the star, or if its star is 15 % brighter or fainter.
     # The stacks are never copied as a whole, because they may be larger than the memory.
     median = _median(data, valid, group)
     rows, columns = np.indices(median.shape)
-    x, y = center[group].mean(axis=0)
+    x, y = frames["center"][group].mean(axis=0)
     near = (
         np.hypot((columns - x) * pixelscale[0], (rows - y) * pixelscale[1]) < _MASKED_PIXELS_ARCSEC
     )
@@ -318,29 +291,7 @@ def judge_integrations(
                     f"{name}: {int(deviating.sum())} pixels that deviate "
                     "from the median of all are masked"
                 )
-    return Judgement(kept, tuple(remarks))
-
-
-def judge_pointings(
-    data: Stack,
-    error: Stack,
-    valid: Mask,
-    center: Stack,
-    angles: NDArray[np.float64] | None,
-    pixelscale: tuple[float, float],
-    names: Sequence[str],
-) -> Judgement:
-    """Compare the integrations of every pointing with their median, see `judge_integrations`.
-
-    `angles` are position angles in degrees, (frames,), or None.
-    """
-    kept = np.ones(len(data), dtype=bool)
-    remarks: tuple[str, ...] = ()
-    for group in pointings(center, angles):
-        part = judge_integrations(data, error, valid, center, pixelscale, names, group)
-        kept &= part.kept
-        remarks += part.remarks
-    return Judgement(kept, remarks)
+    return remarks
 
 
 def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
@@ -439,7 +390,8 @@ _STARLIT_BOX_SIGMAS = 4.0
 _DARK_PIXELS_SHARE = 0.25
 """Least share of the far pixels that is taken as dark, in a field that is full of sources."""
 
-_NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
+NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
+"""Kernel of the mean of the four neighbours of a pixel."""
 
 
 def calibrated_errors(
@@ -466,16 +418,29 @@ def calibrated_errors(
     # star as it is. Noise that neighbouring pixels share, such as 1/f noise, cancels in the
     # differences and is not counted.
     corrected, ratios = error.copy() if out is None else out, []
-    for k, (ratio, floor) in enumerate(_measured(data, error, valid, center, pixelscale)):
+    y, x = np.indices(data.shape[1:])
+    for k, usable in enumerate(valid):
+        frame, sigma = data[k].astype(float), error[k].astype(float)
+        away = np.hypot((x - center[k, 0]) * pixelscale[0], (y - center[k, 1]) * pixelscale[1])
+        # A pixel is compared only where all of its neighbours are usable.
+        complete = convolve(usable.astype(float), NEIGHBOURS, mode="constant") > 0.99
+        far = dark_pixels(frame, usable & complete & (away > _STARLIGHT_NOISE_ARCSEC))
+        if far.sum() < _FEWEST_FAR_PIXELS:
+            ratios.append(np.nan)
+            continue
+        # The difference x - (a + b + c + d) / 4 has the variance s_x^2 + (s_a^2 + s_b^2 + s_c^2 +
+        # s_d^2) / 16, and `convolve` averages four.
+        difference = frame - convolve(frame, NEIGHBOURS, mode="nearest")
+        predicted = np.sqrt(sigma**2 + convolve(sigma**2, NEIGHBOURS, mode="nearest") / 4)
+        ratio, floor = float(mad_std((difference / predicted)[far])), float(np.median(sigma[far]))
         ratios.append(ratio)
         if not ratio > 0:
             continue
-        sigma = error[k].astype(float)
         # An error below b would get too small or even a negative variance if f < 1: no error is
         # multiplied by less than f.
         least = min(ratio, 1.0) * sigma
         variance = np.maximum(sigma**2 + (ratio**2 - 1) * floor**2, least**2)
-        corrected[k] = np.where(valid[k], np.sqrt(variance), sigma)
+        corrected[k] = np.where(usable, np.sqrt(variance), sigma)
         _log.info("%s, frame %d: the noise far from the star is %.2f of ERR", name, k, ratio)
     return corrected, tuple(ratios)
 
@@ -547,29 +512,3 @@ def why_odd_noise(ratios: Iterable[float]) -> str:
                 "by a factor; or a crowded field or a nebula leaves no dark part of the frame"
             )
     return ""
-
-
-def _measured(
-    data: Image,
-    error: Image,
-    valid: NDArray[np.bool_],
-    center: Image,
-    pixelscale: tuple[float, float],
-) -> Iterator[tuple[float, float]]:
-    """Ratio and median of the errors far from the star, for every frame; NaN if not known."""
-    y, x = np.indices(data.shape[1:])
-    for k, (frame, sigma, usable) in enumerate(zip(data, error, valid, strict=True)):
-        frame, sigma = frame.astype(float), sigma.astype(float)
-        away = np.hypot((x - center[k, 0]) * pixelscale[0], (y - center[k, 1]) * pixelscale[1])
-        # A pixel is compared only where all of its neighbours are usable.
-        complete = convolve(usable.astype(float), _NEIGHBOURS, mode="constant") > 0.99
-        far = dark_pixels(frame, usable & complete & (away > _STARLIGHT_NOISE_ARCSEC))
-        if far.sum() < _FEWEST_FAR_PIXELS:
-            yield np.nan, np.nan
-            continue
-        # The difference x - (a + b + c + d) / 4 has the variance s_x^2 + (s_a^2 + s_b^2 + s_c^2 +
-        # s_d^2) / 16, and `convolve` averages four.
-        difference = frame - convolve(frame, _NEIGHBOURS, mode="nearest")
-        predicted = np.sqrt(sigma**2 + convolve(sigma**2, _NEIGHBOURS, mode="nearest") / 4)
-        ratio = float(mad_std((difference / predicted)[far]))
-        yield ratio, float(np.median(sigma[far]))

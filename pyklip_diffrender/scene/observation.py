@@ -17,18 +17,23 @@ from numpy.typing import ArrayLike, NDArray
 from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.io.units import full_circle, half_circle, rotation_matrix
+from pyklip_diffrender.io.units import (
+    full_circle,
+    half_circle,
+    rotation_matrix,
+    to_mask,
+    to_unit,
+)
 from pyklip_diffrender.scene.aligned_frames import on_detector_pixels
 from pyklip_diffrender.scene.exposure import instrument_of, star_of
 from pyklip_diffrender.scene.integrations import (
-    Judgement,
     calibrated_errors,
-    checked_frames,
     checked_stacks,
-    judge_pointings,
+    judge_integrations,
     mask_unusable,
     pointings,
     selected,
+    unit_of_frames,
     weighted_mean,
 )
 from pyklip_diffrender.scene.jwst_files import read_calints, without_empty
@@ -191,24 +196,15 @@ def _judged(
             frames["pixelscale"], name, out=frames["error"],
         )  # fmt: skip
     original = np.ones(len(frames["data"]), dtype=bool) if empty is None else empty.kept
-    judgement = _judgement(frames, original)
+    names = [f"integration {k + 1} of {len(original)}" for k in np.flatnonzero(original)]
+    judgement = judge_integrations(frames, names)
+    for remark in judgement.remarks:
+        _log.warning("%s: %s", name, remark)
     frames["remarks"] = (*(() if empty is None else empty.remarks), *judgement.remarks)
     if not judgement.kept.any():
         raise NoValidPixelsError(f"{name}: no integration is left: {'; '.join(judgement.remarks)}")
     mask_unusable(frames)
     return frames, judgement.kept, original
-
-
-def _judgement(frames: dict[str, Any], original: NDArray[np.bool_]) -> Judgement:
-    """Compare the integrations that are left of a file with each other."""
-    names = [f"integration {k + 1} of {len(original)}" for k in np.flatnonzero(original)]
-    judgement = judge_pointings(
-        frames["data"], frames["error"], frames["valid"], frames["center"],
-        frames["position_angles"], frames["pixelscale"], names,
-    )  # fmt: skip
-    for remark in judgement.remarks:
-        _log.warning("%s: %s", frames["name"], remark)
-    return judgement
 
 
 @dataclass(frozen=True)
@@ -332,9 +328,19 @@ class Observation:
         NoValidPixelsError
             A frame without valid pixels.
         """
-        return cls(**checked_frames(
-            data, error, valid=valid, unit=unit, pixelscale=pixelscale, center=center, **details
-        ))  # fmt: skip
+        name = details.get("name", cls.name)
+        unit = unit_of_frames(unit, name)
+        frames = checked_stacks(
+            to_unit(data, unit, f"{name}: data"),
+            to_unit(error, unit, f"{name}: error"),
+            valid=None if valid is None else to_mask(valid, f"{name}: valid"),
+            unit=unit,
+            pixelscale=pixelscale,
+            center=center,
+            **details,
+        )
+        mask_unusable(frames)
+        return cls(**frames)
 
     @classmethod
     def from_fits(
@@ -377,11 +383,6 @@ class Observation:
         """
         with open_fits(path, images=False) as hdus:
             return cls(**frames_in(hdus, path, every_integration=every_integration, star=star))
-
-    @classmethod
-    def means_from_hdus(cls, hdus: fits.HDUList, path: str | os.PathLike[str]) -> Observation:
-        """Read the file at that path, which `open_fits` has opened, as `means_from_fits` does."""
-        return cls(**means_in(hdus, path))
 
     @classmethod
     def means_from_fits(

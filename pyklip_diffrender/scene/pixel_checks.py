@@ -16,10 +16,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter, map_coordinates, shift, uniform_filter
 
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.scene.integrations import dark_pixels
+from pyklip_diffrender.scene.integrations import NEIGHBOURS, dark_pixels
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import images_of_stars
-from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symmetry, stamp_about
+from pyklip_diffrender.scene.star_place import (
+    center_of_pattern,
+    center_of_symmetry,
+    parabola_vertex,
+    stamp_about,
+)
 
 Image = NDArray[np.float64]
 
@@ -100,8 +105,6 @@ _SYMMETRIES: dict[str, Callable[[Image], Image]] = {
     "transposed": np.transpose,
     "transposed and turned by 180 degrees": lambda image: image[::-1, ::-1].T,
 }
-
-_NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 
 
 def why_few_pixels(observation: Observation) -> str:
@@ -205,8 +208,8 @@ def _contrast_of_source(observation: Observation) -> float:
     data, _, valid = _mean(observation)
     image = np.where(valid, data - float(np.quantile(data[valid], 0.25)), 0.0)
     rows, columns = np.indices(image.shape)
-    x, y = observation.mean_center
-    outside = np.hypot(columns - x, rows - y) * scale > _OTHER_SOURCE_FROM_ARCSEC
+    distance = _distance(observation)
+    outside = distance > _OTHER_SOURCE_FROM_ARCSEC
     peak = _peak(np.where(outside, gaussian_filter(image, 1.0), -np.inf))
     if _likeness(image, peak, source, _peak(source), scale) < _POINT_SOURCE_CORRELATION:
         return np.inf
@@ -218,7 +221,7 @@ def _contrast_of_source(observation: Observation) -> float:
     symmetric = np.clip(np.minimum(image, mirrored), 0.0, None)
     # What may be light of the star: the model of the source's wings is not perfect.
     left = uniform_filter(image - _SYMMETRIC_LIGHT_SHARE * symmetric, 3)
-    behind = np.hypot(columns - x, rows - y) * scale < _SYMMETRY_OFFSET_ARCSEC / 2
+    behind = distance < _SYMMETRY_OFFSET_ARCSEC / 2
     # Fluxes in units of the model's star: at most `most` for the star behind the mask, `flux` for
     # the source outside it.
     most = max(float(left[behind].max()), 0.0) / float(uniform_filter(star, 3).max())
@@ -232,12 +235,8 @@ def _peak(image: Image) -> Image:
     row, column = np.unravel_index(int(image.argmax()), image.shape)
     place = np.array([column, row], dtype=float)
     for axis, (values, k) in enumerate(((image[row], column), (image[:, column], row))):
-        # The parabola through three neighbours l, m, h has its vertex (l - h) / 2 (l - 2 m + h)
-        # from the middle one.
         if 0 < k < len(values) - 1 and np.isfinite(values[k - 1 : k + 2]).all():
-            low, middle, high = values[k - 1 : k + 2]
-            curvature = low - 2 * middle + high
-            place[axis] += 0.5 * (low - high) / curvature if curvature < 0 else 0.0
+            place[axis] += parabola_vertex(values, int(k))
     return place
 
 
@@ -364,10 +363,12 @@ def why_odd_unit(observation: Observation) -> str:
 
     Only frames in MJy/sr with 2000 pixels far from the star are judged.
     """
-    difference, usable = _noise(observation)
+    data, _, valid = _mean(observation)
+    usable = valid & (_distance(observation) > _NOISE_FROM_ARCSEC)
     if usable.sum() < _FEWEST_PIXELS or observation.unit != u.MJy / u.sr:
         return ""
-    dark = dark_pixels(_mean(observation)[0], usable)
+    dark = dark_pixels(data, usable)
+    difference = data - convolve(data, NEIGHBOURS, mode="nearest")
     # A pixel less the mean of four has the variance 1 + 1/4.
     scatter = float(mad_std(difference[dark])) / 1.25**0.5
     low, high = _PLAUSIBLE_SCATTER_MJY_SR
@@ -398,10 +399,3 @@ def _stamp(observation: Observation) -> tuple[Image, Image, Image] | None:
     return stamp_about(
         data, error, valid, observation.mean_center, float(np.mean(observation.pixelscale))
     )
-
-
-def _noise(observation: Observation) -> tuple[Image, NDArray[np.bool_]]:
-    """Differences from neighbouring pixels, and which of them are far from the star."""
-    data, _, valid = _mean(observation)
-    difference = data - convolve(data, _NEIGHBOURS, mode="nearest")
-    return difference, valid & (_distance(observation) > _NOISE_FROM_ARCSEC)

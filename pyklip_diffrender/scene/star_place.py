@@ -99,13 +99,14 @@ def center_of_symmetry(image: Image) -> Image:
     transform = np.fft.rfft2(np.maximum(image, 0.0), (size, size))
     own = np.fft.irfft2(transform**2, (size, size))
     row, column = np.unravel_index(int(own.argmax()), own.shape)
-    column_peak = column + _vertex(own[row], int(column))
-    row_peak = row + _vertex(own[:, column], int(row))
+    column_peak = column + parabola_vertex(own[row], int(column))
+    row_peak = row + parabola_vertex(own[:, column], int(row))
     return np.array([column_peak, row_peak]) / 2 - len(image) // 2
 
 
-def _vertex(values: Image, peak: int) -> float:
+def parabola_vertex(values: Image, peak: int) -> float:
     """Vertex of the parabola through a maximum and its neighbours, relative to the maximum."""
+    # Through three neighbours l, m, h it is (l - h) / 2 (l - 2 m + h) from the middle one.
     low, middle, high = values[[peak - 1, peak, (peak + 1) % len(values)]]
     curvature = low - 2 * middle + high
     return float(0.5 * (low - high) / curvature) if curvature < 0 else 0.0
