@@ -37,7 +37,7 @@ from benchmarks import poppy_reference as reference
 from benchmarks.parity_cases import BARE, CALL, EMBEDDED, FULL, differences
 from benchmarks.stpsf_data import make_stpsf_data, nircam, wss_file
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf, load_wss_opd
-from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
+from pyklip_diffrender.instrument.masks import jwst_pupil, lyot_openings
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -93,7 +93,7 @@ def against_poppy(npix: int) -> Rows:
     system = reference.coronagraph(
         jwst_pupil(npix).numpy(),
         reference.lopsided_opd(npix),
-        polygon_coverage(maskrnd_openings(), PupilGrid.full(npix)).numpy(),
+        polygon_coverage(lyot_openings("MASKRND"), PupilGrid.full(npix)).numpy(),
         reference.zernike_opd(reference.lopsided_zernikes(), npix),
         oversample=4,
         fov_pixels=80,

@@ -19,8 +19,7 @@ from benchmarks.hard_cases import (
     wavefront,
     worst,
 )
-from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.masks import MASKS
+from pyklip_diffrender.instrument.masks import MASKS, jwst_pupil, lyot_openings
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.scene.objects import Planet, Scene
@@ -39,7 +38,7 @@ def _plain_fft(mas):
     planes = reference.coronagraph(
         jwst_pupil(NPIX).numpy(),
         reference.lopsided_opd(NPIX),
-        polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy(),
+        polygon_coverage(lyot_openings("MASKRND"), PupilGrid.full(NPIX)).numpy(),
         reference.zernike_opd(reference.lopsided_zernikes(), NPIX),
         oversample=4,
         fov_pixels=32,

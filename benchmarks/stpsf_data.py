@@ -15,7 +15,7 @@ import torch
 from astropy.io import fits
 from astropy.table import Table
 
-from pyklip_diffrender.instrument.jwst import jwst_pupil, jwst_segments, maskrnd_openings
+from pyklip_diffrender.instrument.masks import jwst_pupil, jwst_segments, lyot_openings
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, polygon_coverage
 
@@ -57,7 +57,7 @@ def segments(npix):
 @cache
 def lyot_stop(npix):
     """MASKRND without its first opening, entrance-pupil orientation."""
-    return polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy()
+    return polygon_coverage(lyot_openings("MASKRND")[1:], PupilGrid.full(npix)).numpy()
 
 
 def _write(path, primary, *hdus):

@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import inspect
 import os
 import re
 import sys
@@ -47,7 +48,11 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
-numpydoc_xref_aliases = {name: f"pyklip_diffrender.errors.{name}" for name in errors.__all__}
+numpydoc_xref_aliases = {
+    name: f"pyklip_diffrender.errors.{name}"
+    for name, each in vars(errors).items()
+    if inspect.isclass(each) and issubclass(each, Exception)
+}
 numpydoc_xref_aliases["OPDMap"] = "pyklip_diffrender.wavefront.OPDMap"
 
 # References have to exist, but for words that stand in single backticks or in the type of a

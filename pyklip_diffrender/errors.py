@@ -9,22 +9,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = [
-    "ArchiveError",
-    "CorruptFileError",
-    "DiffrenderError",
-    "DiffrenderWarning",
-    "ExistingFileError",
-    "IncompatibleSetupError",
-    "MissingFileError",
-    "MissingOPDError",
-    "NoValidPixelsError",
-    "NonFiniteError",
-    "RefinementError",
-    "ShapeError",
-    "UnitError",
-]
-
 
 class DiffrenderError(Exception):
     """Base of all errors of this package."""

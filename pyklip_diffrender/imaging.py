@@ -25,7 +25,7 @@ Williams, "Gaussian Processes for Machine Learning" (2006).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ from torch import Tensor
 
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.convolution import fft_convolve
+from pyklip_diffrender.optics.grid import fft_convolve
 from pyklip_diffrender.refinement import Refinement
 
 # Interpolation of an image at many places, as a sparse matrix.
@@ -298,7 +298,9 @@ class SkyModel:
         signs = np.random.default_rng(seed).choice([-1.0, 1.0], len(y))
         kept = np.full(len(y), np.nan)
         angle = first.observation.position_angle
-        for some in _batches(np.unique(comb)):
+        combs = np.unique(comb)
+        for start in range(0, len(combs), _SOLVED_AT_A_TIME):
+            some = combs[start : start + _SOLVED_AT_A_TIME]
             members = [np.flatnonzero(comb == each) for each in some]
             skies = self.estimate(self._sources(members, y, x, signs))
             for sky, chosen in zip(skies, members, strict=True):
@@ -333,9 +335,3 @@ def _by_ring(values: Image, at: Image, distance: Image) -> Image:
     known = [k for k in np.unique(ring) if (ring == k).sum() >= _FEWEST_PLACES_PER_RING]
     medians = [float(np.median(values[ring == k])) for k in known]
     return np.asarray(np.interp(distance, np.array(known) + 0.5, medians))
-
-
-def _batches(items: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Split items into parts that are solved together."""
-    for start in range(0, len(items), _SOLVED_AT_A_TIME):
-        yield items[start : start + _SOLVED_AT_A_TIME]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pyklip_diffrender.instrument.jwst import (
+from pyklip_diffrender.instrument.masks import (
     TABULATED_GAP,
     is_jwst_pupil,
     jwst_pupil,

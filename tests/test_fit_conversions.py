@@ -11,7 +11,7 @@ import pyklip_diffrender as dr
 from benchmarks.noisy_stars import READ_NOISE, observed
 from benchmarks.stpsf_data import lopsided
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf
-from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.instrument.masks import lyot_openings
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.refinement import FitSettings, Status
 from pyklip_diffrender.scene.objects import Planet
@@ -85,7 +85,7 @@ def test_a_frame_made_by_stpsf(stpsf_path):
     )
     model = from_webbpsf(nircam(stpsf_path, npix), add_distortion=True, **call)
     later = from_webbpsf(nircam(stpsf_path, npix, drifted), **call).entrance.opd
-    stop = polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy() > 0.5
+    stop = polygon_coverage(lyot_openings("MASKRND")[1:], PupilGrid.full(npix)).numpy() > 0.5
     check(
         model, model.entrance.opd.numpy(), later.numpy(), images, planet, 3e10,
         stop & model.entrance.lit.numpy(), FitSettings(cycles=8.0, response_npix=64), seed=8,

@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 
 from pyklip_diffrender.cli.session import importing
 from pyklip_diffrender.detection import tails
-from pyklip_diffrender.optics.convolution import fft_convolve
+from pyklip_diffrender.optics.grid import fft_convolve
 
 
 @pytest.mark.parametrize("shape", [(7, 12), (30, 31)])

@@ -15,7 +15,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.instrument.jwst import jwst_pupil
+from pyklip_diffrender.instrument.masks import jwst_pupil
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io import sha256
 from pyklip_diffrender.optics.grid import PupilGrid, resample

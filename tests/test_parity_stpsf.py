@@ -8,8 +8,7 @@ from benchmarks.parity_cases import BARE, CALL, EMBEDDED, FULL, differences
 from benchmarks.stpsf_data import lyot_stop, nircam
 from pyklip_diffrender.bridges import from_webbpsf
 from pyklip_diffrender.instrument import detector_place
-from pyklip_diffrender.instrument.jwst import maskrnd_openings
-from pyklip_diffrender.instrument.masks import MASKS, BarMask
+from pyklip_diffrender.instrument.masks import MASKS, BarMask, lyot_openings
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
@@ -79,7 +78,7 @@ def test_the_stop_moves_and_turns_as_in_stpsf(stpsf_path):
     model = from_webbpsf(nircam(stpsf_path, **BARE), **call)
     truth = nircam(stpsf_path, **BARE, **options).calc_psf(**call)[1].data
     # The synthetic stop lacks the first opening.
-    openings = maskrnd_openings()[1:]
+    openings = lyot_openings("MASKRND")[1:]
     stop = LyotStop(openings, NPIX, JWST_DIAMETER, torch.float64, torch.device("cpu"))
     assert np.abs(stop.amplitude({}).numpy().sum() - lyot_stop(NPIX).sum()) < 1e-9
     planes = [stop if plane.name == "MASKRND" else plane for plane in model.between]

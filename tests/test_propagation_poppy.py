@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks import poppy_reference as reference
-from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
+from pyklip_diffrender.instrument.masks import jwst_pupil, lyot_openings
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 
@@ -33,7 +33,7 @@ def ours(occulter_sampling=None, route="auto"):
 def system(oversample):
     return reference.coronagraph(
         jwst_pupil(NPIX).numpy(), reference.lopsided_opd(NPIX),
-        polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy(),
+        polygon_coverage(lyot_openings("MASKRND"), PupilGrid.full(NPIX)).numpy(),
         reference.zernike_opd(reference.lopsided_zernikes(), NPIX), oversample=oversample,
         fov_pixels=80, pixelscale=NIRCAM_LW_PIXELSCALE,
     )  # fmt: skip

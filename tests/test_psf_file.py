@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.jwst import jwst_pupil
+from pyklip_diffrender.instrument.masks import jwst_pupil
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 
 OPD = 5e-8 * np.random.default_rng(1).standard_normal((64, 64))

@@ -12,7 +12,7 @@ from scipy import optimize
 import pyklip_diffrender as dr
 from benchmarks.noisy_stars import READ_NOISE, DriftedStar, drifted_star
 from pyklip_diffrender import errors
-from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.instrument.masks import lyot_openings
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.refinement import FitSettings, Status, refine
 from pyklip_diffrender.refinement.fit_result import breakdown_explained
@@ -131,7 +131,7 @@ def test_gauss_newton_recovers_alignment_flux_and_background(fit):
 
 def test_the_refined_wavefront_is_nearer_to_the_truth(bright, fit):
     """Behind the Lyot stop; what the stop hides stays at the prior."""
-    stop = polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy() > 0.5
+    stop = polygon_coverage(lyot_openings("MASKRND"), PupilGrid.full(NPIX)).numpy() > 0.5
     before, after = ((map_ - bright.later)[stop].std() for map_ in (bright.opd, fit.wavefront))
     assert after < 0.6 * before
 

@@ -136,7 +136,7 @@ def _instrument_and_wavefront() -> list[Breakage]:
         ),
         Breakage(
             "map-unit", "maps are converted to metres",
-            "data = raw * u.Unit(spelled).to(u.m)", "data = raw * u.Unit(spelled).to(u.um)",
+            "data = raw * length.to(u.m)", "data = raw * length.to(u.um)",
             "opd",
         ),
         Breakage(

@@ -19,7 +19,7 @@ import numpy as np
 from astropy.table import Table
 from matplotlib.figure import Figure
 
-from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.instrument.masks import lyot_openings
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.wavefront.opd import resample
 
@@ -43,7 +43,7 @@ LIMIT = 20.0
 def seen_change(setup: Setting, opd: Image) -> Image:
     """Change since the map, nm, coarse, NaN outside the Lyot stop's openings, mean 0."""
     grid = PupilGrid.full(SAMPLES, setup.model.diameter)
-    stop = polygon_coverage(maskrnd_openings(), grid).numpy() > 0.5
+    stop = polygon_coverage(lyot_openings("MASKRND"), grid).numpy() > 0.5
     change = 1e9 * (resample(opd, SAMPLES) - resample(setup.measured, SAMPLES))
     return np.where(stop, change - change[stop].mean(), np.nan)
 

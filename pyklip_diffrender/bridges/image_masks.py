@@ -11,7 +11,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import poppy
@@ -61,13 +61,6 @@ def padded_pupil(npix: int, diameter: float, padding: float) -> PupilGrid:
     return PupilGrid(npix, diameter, (first, first + size), (first, first + size))
 
 
-class MaskPart(Protocol):
-    """A part of a mask, which changes the field in the pupil behind the mask."""
-
-    def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
-        """Field to subtract on the window `onto`; `spacing` of the lattice in radians."""
-
-
 class BoxPart:
     """A part that is clear outside a box: two matrix transforms on the lattice inside it.
 
@@ -109,7 +102,7 @@ class BoxPart:
         return self._transform(wavefront, spacing, wavefront.grid).forward(wavefront.field)
 
     def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
-        """See `MaskPart`."""
+        """Field to subtract on the window `onto`; `spacing` of the lattice in radians."""
         blocked = self.cells(wavefront, spacing)[2].to(wavefront.field)
         removed = self.focal_field(wavefront, spacing) * blocked
         return self._transform(wavefront, spacing, onto).inverse(removed, spacing**2)
@@ -172,7 +165,7 @@ class SeparablePart:
         return torch.fft.ifft(product, dim=dim).narrow(dim, first, size)
 
     def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
-        """See `MaskPart`."""
+        """See `BoxPart`."""
         field, grid = wavefront.field, wavefront.grid
         if self.along_y is None:
             field = grid.crop(field, replace(onto, columns=grid.columns))
@@ -181,6 +174,10 @@ class SeparablePart:
         if self.along_x is None:
             return replace(grid, rows=onto.rows).crop(field, onto)
         return self._convolved(field, "x", wavefront, spacing, onto)
+
+
+MaskPart = BoxPart | SeparablePart
+"""A part of a mask, which changes the field in the pupil behind the mask."""
 
 
 class SampledOcculter(Plane):

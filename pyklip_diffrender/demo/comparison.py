@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.detection.metrics import annulus_snr, star_model_error, throughput
-from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.instrument.masks import lyot_openings
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import write_fits, write_table
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
@@ -257,7 +257,7 @@ def draw_demo(result: DemoResult) -> Any:
 def _draw_changes(axes: Any, result: DemoResult) -> None:
     """Draw the true and the fitted change of the wavefront on one scale."""
     pupil = PupilGrid.full(result.model.npix, result.model.diameter)
-    stop = polygon_coverage(maskrnd_openings(), pupil).numpy() > 0.5
+    stop = polygon_coverage(lyot_openings("MASKRND"), pupil).numpy() > 0.5
     changes = [
         1e9 * (opd - result.measured.data) for opd in (result.true_opd, result.fit.wavefront)
     ]

@@ -24,7 +24,7 @@ from pyklip_diffrender.detection.field import (
     separation_of,
 )
 from pyklip_diffrender.io.units import rotation_matrix
-from pyklip_diffrender.optics.convolution import fft_convolve
+from pyklip_diffrender.optics.grid import fft_convolve
 from pyklip_diffrender.optics.planes import Detector
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement import FrameFit, Refinement

@@ -14,8 +14,15 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.jwst import jwst_pupil, maskbar_openings, maskrnd_openings
-from pyklip_diffrender.instrument.masks import BarMask, DetectorPlace, detector_place, require_mask
+from pyklip_diffrender.instrument.masks import (
+    LYOT_STOPS,
+    BarMask,
+    DetectorPlace,
+    detector_place,
+    jwst_pupil,
+    lyot_openings,
+    require_mask,
+)
 from pyklip_diffrender.instrument.spectrum import filter_bandpass, filter_throughput
 from pyklip_diffrender.io.files import embedded_table
 from pyklip_diffrender.io.units import Bound, require_shape, to_metres, to_number, to_pair
@@ -122,15 +129,6 @@ signs of y and of the rotation, and poppy cuts shifts to whole samples of 1/1024
 has the stop aligned. Alignment-only fits of this package to one frame each of three stars gave
 shifts of -0.0109 to -0.0121 and 0.0040 to 0.0054 and rotations of 0.39 to 0.54 deg.
 """
-
-
-_LYOT_OPENINGS = {"MASKRND": maskrnd_openings, "MASKBAR": maskbar_openings}
-"""The Lyot stops, in both channels."""
-
-
-@lru_cache(maxsize=4)
-def _pupil(npix: int, segment_gap: float | None) -> Tensor:
-    return jwst_pupil(npix, segment_gap)
 
 
 def nircam_coronagraph(
@@ -247,7 +245,7 @@ def nircam_coronagraph(
     bandpass = _bandpass(recipe)
     detector = _detector(place, recipe)
     _require_samples(npix, place.period(bar_reach) if image_mask else 0.0, detector, bandpass)
-    amplitude = _pupil(npix, recipe["segment_gap"]).to(detector.device)
+    amplitude = jwst_pupil(npix, recipe["segment_gap"]).to(detector.device)
     return InstrumentSystem(
         EntrancePupil(amplitude, JWST_DIAMETER, dtype, name="JWST pupil"),
         _planes(place, bandpass, recipe),
@@ -304,7 +302,7 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
 
 
 def _require_supported(recipe: Mapping[str, Any]) -> None:
-    if recipe["pupil_mask"] not in (None, *_LYOT_OPENINGS):
+    if recipe["pupil_mask"] not in (None, *LYOT_STOPS):
         raise IncompatibleSetupError(
             f"pupil_mask: got {recipe['pupil_mask']!r}, expected 'auto', 'MASKRND', 'MASKBAR' or "
             "None"
@@ -369,7 +367,7 @@ def _planes(place: DetectorPlace, bandpass: Bandpass, recipe: Mapping[str, Any])
     if recipe["pupil_mask"] is not None:
         planes.append(
             LyotStop(
-                _LYOT_OPENINGS[recipe["pupil_mask"]](),
+                lyot_openings(recipe["pupil_mask"]),
                 recipe["npix"],
                 JWST_DIAMETER,
                 dtype,

@@ -52,15 +52,11 @@ def _throughputs() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     return curves
 
 
-@lru_cache(maxsize=1)
-def _vega() -> dict[str, float]:
-    table = embedded_table("nircam_vega")
-    return dict(zip(map(str, table["filter"]), map(float, table["flux_density"]), strict=True))
-
-
 def vega_flux_density(filter: str | None) -> float | None:
     """Flux density of Vega magnitude 0 in a filter, Jy; None if it is not known."""
-    return _vega().get((filter or "").upper())
+    table = embedded_table("nircam_vega")
+    known = dict(zip(map(str, table["filter"]), map(float, table["flux_density"]), strict=True))
+    return known.get((filter or "").upper())
 
 
 def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -77,15 +73,6 @@ def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float6
         ) from None
 
 
-def blackbody(temperature: float, wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """Photons per unit wavelength of a blackbody of `temperature` (K), at wavelengths in m."""
-    wavelength = native_float64(wavelengths) * u.m
-    radiance = BlackBody(temperature * u.K, scale=1 * u.W / (u.m**3 * u.sr))(wavelength)
-    # The energy of a photon is h c / lambda.
-    photons = radiance * wavelength / (constants.h * constants.c)
-    return native_float64(photons.to_value(1 / (u.s * u.m**3 * u.sr)))
-
-
 def filter_bandpass(
     name: str,
     nlambda: int,
@@ -98,8 +85,6 @@ def filter_bandpass(
     IncompatibleSetupError for an unknown filter, or a spectrum that does not cover it or has no
     light in it.
     """
-    if nlambda < 1:
-        raise ValueError(f"nlambda: got {nlambda}, expected at least 1")
     wavelength, throughput = filter_throughput(name)
     # Intervals are between the wavelengths at which the throughput is 1 % of its peak; intervals
     # without light are omitted. Every wavelength is the photon-weighted mean of its interval, for
@@ -119,7 +104,11 @@ def filter_bandpass(
             )
         photons = np.interp(middle, grid, flux)
     else:
-        photons = blackbody(to_number(source, u.K, "source", "positive"), middle)
+        temperature = to_number(source, u.K, "source", "positive") * u.K
+        radiance = BlackBody(temperature, scale=1 * u.W / (u.m**3 * u.sr))(middle * u.m)
+        # The energy of a photon is h c / lambda.
+        quanta = radiance * (middle * u.m) / (constants.h * constants.c)
+        photons = native_float64(quanta.to_value(1 / (u.s * u.m**3 * u.sr)))
     photons = (photons * np.interp(middle, wavelength, throughput)).reshape(nlambda, -1)
     weights = photons.sum(axis=1)
     detected = weights > 0

@@ -91,10 +91,6 @@ class LinearFrame(FrameRows):
         parts = [on_rows @ flat[:, piece].double() for piece in pixel_pieces(flat.shape[1])]
         return torch.cat(parts, dim=-1).unflatten(-1, self.jacobian.shape[1:])
 
-    def pulled(self, images: Tensor) -> Tensor:
-        """Products of the derivatives with images, (k, ny, nx): (rows, k), of the images' type."""
-        return _times_images(self.jacobian.flatten(1), images)
-
 
 def _times_images(rows: Tensor, images: Tensor) -> Tensor:
     """Products of float32 rows (n, pixels) and images (k, ny, nx): (n, k), of the images' type."""
@@ -378,7 +374,8 @@ class LinearModel:
         for k, image in images.items():
             frame = self.frames[k]
             weighted = frame.weight.square().to(image.dtype) * image
-            total += frame.onto_unknowns(frame.pulled(weighted).double(), size)
+            pulled = _times_images(frame.jacobian.flatten(1), weighted)
+            total += frame.onto_unknowns(pulled.double(), size)
         if self.noise.shares_pattern:
             total -= _times_images(self._pattern_rows, self.noise.summed(images)).double()
         return total

@@ -306,17 +306,6 @@ _MODES_AT_A_TIME = 128
 """Number of modes whose images are computed at a time."""
 
 
-def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
-    """Return the number of pupil samples of `coarse_copy`."""
-    masks = [plane.radius for plane in model.between if isinstance(plane, CompactOcculter)]
-    reach = _bar_reach(model) or max(masks, default=0.0)
-    period = max(_field(model), reach + STAR_RADIUS)
-    npix = doubled_samples(npix, period, min(model.bandpass.wavelengths), model.diameter)
-    if "npix" not in model.adjustable or model.npix <= npix or model.npix % npix:
-        return model.npix
-    return npix
-
-
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """Return a cheaper copy of a model for derivatives, or the model if its pupil is as coarse.
 
@@ -326,11 +315,15 @@ def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """
     if "npix" not in model.adjustable or model.npix <= npix:
         return model
+    bar_reach = _bar_reach(model)
+    masks = [plane.radius for plane in model.between if isinstance(plane, CompactOcculter)]
+    period = max(_field(model), (bar_reach or max(masks, default=0.0)) + STAR_RADIUS)
+    npix = doubled_samples(npix, period, min(model.bandpass.wavelengths), model.diameter)
     sampling = model.recipe.get("occulter_sampling") or math.inf
     coarser = {
-        "npix": coarse_npix(model, npix),
+        "npix": npix if model.npix % npix == 0 else model.npix,
         "occulter_sampling": min(_CELLS_PER_LAMBDA_D, sampling),
-        "bar_reach": _bar_reach(model),
+        "bar_reach": bar_reach,
         "dtype": torch.float32,
     }
     return model.with_fidelity(**{k: v for k, v in coarser.items() if k in model.adjustable})
@@ -578,7 +571,7 @@ class Reading:
         """
         slopes, error = self._cache.slopes_within(opd, values, names, self._allowed, self._keep)
         self.farthest = max(self.farthest, error)
-        return self._cache.image_slopes(fields, values, names, slopes)
+        return image_derivatives(self._cache.coarse, fields, values, names, slopes)
 
 
 class ResponseCache:
@@ -605,18 +598,9 @@ class ResponseCache:
         self._slopes: list[tuple[_About, dict[str, list[Tensor]]]] = []
         self.few = at_few_wavelengths(model, wavelengths)
         """The model at the wavelengths of the derivatives, which gives the field of the star."""
-        self._coarse = coarse_copy(self.few, npix)
-        self._last_pupil = LastPupil(self._coarse)
-
-    def image_slopes(
-        self,
-        fields: Sequence[Tensor],
-        values: dict[str, Tensor],
-        names: tuple[str, ...],
-        slopes: dict[str, list[Tensor]],
-    ) -> Tensor:
-        """Derivatives of the image, (components, ny, nx), from derivatives of the field."""
-        return image_derivatives(self._coarse, fields, values, names, slopes)
+        self.coarse = coarse_copy(self.few, npix)
+        """The coarse model that is differentiated by parameters."""
+        self._last_pupil = LastPupil(self.coarse)
 
     def slopes_within(
         self,
@@ -637,7 +621,7 @@ class ResponseCache:
                 about.now = dict(values)
             return slopes, error
         del self._slopes[: max(0, len(self._slopes) + 1 - keep)]
-        slopes = field_derivatives(self._coarse, downsample(opd, self._coarse.npix), values, names)
+        slopes = field_derivatives(self.coarse, downsample(opd, self.coarse.npix), values, names)
         self._slopes.append((_About(inside, dict(values), dict(values)), slopes))
         return slopes, 0.0
 

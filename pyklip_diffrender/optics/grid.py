@@ -1,4 +1,4 @@
-"""Pupil grids, the exact rasterisation of polygons onto them, and Zernike polynomials.
+"""Pupil grids, the exact rasterisation of polygons onto them, Zernike polynomials, convolution.
 
 Orientation: all pupil planes are in OTE entrance-pupil orientation, x along +V2 and y along
 +V3, arrays [y, x], pixel centres at ``(arange(n) - (n - 1) / 2) * D / n``.
@@ -13,6 +13,7 @@ from math import comb, sqrt
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
@@ -146,6 +147,25 @@ def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
             maps, size=(npix, npix), mode="bilinear", align_corners=False, antialias=True
         )
     return np.asarray(maps.reshape(*opd.shape[:-2], npix, npix).numpy())
+
+
+def fft_convolve(
+    images: NDArray[np.float64], kernel: NDArray[np.float64], *, full: bool = False
+) -> NDArray[np.float64]:
+    """Convolve images, (..., ny, nx), with a kernel, (my, mx); zero beyond their edges.
+
+    The result has the size of the images, or, if `full`, every pixel that light gets to,
+    (..., ny + my - 1, nx + mx - 1). A kernel is about its pixel (my - 1) // 2, (mx - 1) // 2.
+    """
+    # As scipy.signal.fftconvolve, whose import loads all of scipy.stats.
+    sides = np.array(images.shape[-2:]), np.array(kernel.shape)
+    ny, nx = sides[0] + sides[1] - 1
+    padded = (next_fast_len(int(ny), real=True), next_fast_len(int(nx), real=True))
+    result = irfft2(rfft2(images, padded) * rfft2(kernel, padded), padded)[..., :ny, :nx]
+    if not full:
+        y, x = (sides[1] - 1) // 2
+        result = result[..., y : y + sides[0][0], x : x + sides[0][1]]
+    return np.ascontiguousarray(result)
 
 
 def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:

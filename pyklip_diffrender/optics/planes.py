@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
-from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, native_float64
 from pyklip_diffrender.optics.grid import (
     PupilGrid,
@@ -90,11 +90,6 @@ def has_memory(tensor: Tensor) -> bool:
     return unpack_dual(tensor).tangent is None
 
 
-def is_plain(tensor: Tensor) -> bool:
-    """Whether a tensor takes part in no differentiation at all."""
-    return has_memory(tensor) and not (tensor.requires_grad and torch.is_grad_enabled())
-
-
 def position_of(values: Mapping[str, Tensor], names: Iterable[str]) -> Position | None:
     """Values of the named parameters, or None if a parameter is being differentiated.
 
@@ -102,9 +97,10 @@ def position_of(values: Mapping[str, Tensor], names: Iterable[str]) -> Position 
     """
     position = []
     for name in sorted(set(names) & set(values)):
-        if not is_plain(values[name]):
+        value = values[name]
+        if not has_memory(value) or (value.requires_grad and torch.is_grad_enabled()):
             return None
-        position += [(name, number) for number in values[name].flatten().tolist()]
+        position += [(name, number) for number in value.flatten().tolist()]
     return tuple(position)
 
 
@@ -651,12 +647,9 @@ class LinearResampling:
             for i in (0, 1)
             for j in (0, 1)
         ]
-        self.shape = shape
 
     def __call__(self, image: Tensor) -> Tensor:
         """Resample (..., rows, columns)."""
-        if image.shape[-2:] != self.shape:
-            raise ShapeError(f"image: got {tuple(image.shape[-2:])}, made for {self.shape}")
         flat = image.flatten(-2)
         total = torch.zeros((), dtype=image.dtype, device=image.device)
         for index, weight in self._taps:
@@ -673,8 +666,6 @@ class PixelCrosstalk:
 
     def __init__(self, kernel: ArrayLike) -> None:
         values = native_float64(kernel)
-        if values.ndim != 2 or values.shape[0] % 2 == 0 or values.shape[1] % 2 == 0:
-            raise ShapeError(f"kernel: got shape {values.shape}, expected two odd lengths")
         self.kernel = torch.from_numpy(values / values.sum())
 
     def __call__(self, image: Tensor) -> Tensor:

@@ -189,7 +189,9 @@ class PointSources:
         images = torch.empty(shape, dtype=torch.float32, device=self.model.device)
         with torch.no_grad():
             distances = self.positions(rows, columns).norm(dim=-1)
-            needs_double, masked = self._needs_double(distances), distances <= self.reach
+            radius = self._radius if self.model.dtype == torch.float64 else 0.0
+            needs_double = distances < _DOUBLE_PRECISION_MASK_RADII * radius
+            masked = distances <= self.reach
             for kind in ((False, False), (False, True), (True, True)):
                 selected = torch.nonzero((needs_double == kind[0]) & (masked == kind[1])).flatten()
                 for part in selected.split(self._batch(kind[0])) if len(selected) else ():
@@ -208,11 +210,6 @@ class PointSources:
         if len(pair[0]) != len(pair[1]):
             raise ShapeError(f"got {len(pair[0])} rows and {len(pair[1])} columns")
         return pair[0], pair[1]
-
-    def _needs_double(self, distances: Tensor) -> Tensor:
-        """Whether sources at distances from the axis need double precision, (k,)."""
-        radius = self._radius if self.model.dtype == torch.float64 else 0.0
-        return distances < _DOUBLE_PRECISION_MASK_RADII * radius
 
     def _batch(self, double: bool) -> int:
         if self.route == "lattice":
@@ -305,7 +302,11 @@ class _Wave:
             arrays += [lattice.blocked, focus, kernel]
             self._lattice = lattice
             self.size = max(self.size, kernel.numel())
-        self._tables = _in_both_precisions(arrays)
+        # In single and double precision, by the type of real numbers.
+        self._tables = {
+            real: [a.to(real.to_complex() if a.is_complex() else real) for a in arrays]
+            for real in (torch.float32, torch.float64)
+        }
 
     @staticmethod
     def _transform(field: Tensor, like: Wavefront, axes: Sequence[Tensor], shear: float) -> Tensor:
@@ -329,14 +330,6 @@ class _Wave:
             light = _cut(focus, up * qy, left * qx, tuple(blocked.shape)).mul_(blocked)
             field -= self._lattice.convolve(light, kernel)
         total.add_(field.real.square().add_(field.imag.square()), alpha=weight)
-
-
-def _in_both_precisions(arrays: Sequence[Tensor]) -> dict[torch.dtype, list[Tensor]]:
-    """Arrays in single and double precision, by the type of real numbers."""
-    return {
-        real: [a.to(real.to_complex() if a.is_complex() else real) for a in arrays]
-        for real in (torch.float32, torch.float64)
-    }
 
 
 def _cut(array: Tensor, top: Tensor, left: Tensor, shape: tuple[int, ...]) -> Tensor:

@@ -26,19 +26,11 @@ from pyklip_diffrender.optics.planes import (
 )
 from pyklip_diffrender.parameters import parameter
 
-_registered = False
-
-
-def one_thread_after_fork() -> None:
-    """Let forked children of this process compute with one thread."""
-    # A fork copies the state of the thread pool of OpenMP, but not its threads: a child of a
-    # process that has computed with several threads, such as a worker of `multiprocessing.Pool`,
-    # would wait for them forever. One thread needs no pool. Children may not raise the number
-    # again.
-    global _registered
-    if not _registered and hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
-        _registered = True
+# A fork copies the state of the thread pool of OpenMP, but not its threads: a child of a process
+# that has computed with several threads, such as a worker of `multiprocessing.Pool`, would wait for
+# them forever. One thread needs no pool. Children may not raise the number again.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 _CPU_ARRAY_BYTES = 3e6
@@ -62,8 +54,6 @@ def batch_of(size: int, dtype: torch.dtype, device: torch.device) -> int:
 Value = Tensor | ArrayLike | float
 
 _ON_AXIS = (0.0, 0.0)
-
-one_thread_after_fork()
 
 
 class Propagation:

@@ -13,7 +13,6 @@ import torch
 from astropy.io import fits
 from astropy.io.fits.verify import VerifyWarning
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -51,27 +50,16 @@ def _samples(system: Propagation, normalize: str, opd: Any, parameters: dict[str
             if kind == "last":
                 light = light / light.sum()
             elif kind == "exit_pupil":
-                light = light / _exit_light(system, tensor, wavelength, parameters)
+                # Share of the light that reaches the last pupil.
+                values = system.values(parameters)
+                wavefront = system.pupil_field(tensor, wavelength, values)
+                wavefront = system.behind_planes(wavefront, values)
+                power = (wavefront.field.abs() ** 2).sum() * wavefront.grid.spacing**2
+                light = light / power
             elif kind == "none":
                 light = light * system.entrance.total
             total = total + weight * light.double().cpu().numpy()
     return np.asarray(total, dtype=np.float64)
-
-
-def _exit_light(
-    system: Propagation, opd: Tensor, wavelength: float, parameters: dict[str, Any]
-) -> Tensor:
-    """Share of the light that reaches the last pupil."""
-    values = system.values(parameters)
-    wavefront = system.behind_planes(system.pupil_field(opd, wavelength, values), values)
-    light: Tensor = (wavefront.field.abs() ** 2).sum() * wavefront.grid.spacing**2
-    return light
-
-
-def _propagations(system: Propagation) -> str:
-    """How a system that was made from poppy's propagates through each image plane."""
-    used = getattr(system, "propagation", None) or {}
-    return ", ".join(f"{name}: {kind}" for name, kind in used.items()) or "compact"
 
 
 def _header(system: Propagation, normalize: str, header: fits.Header) -> None:
@@ -108,7 +96,10 @@ def _header(system: Propagation, normalize: str, header: fits.Header) -> None:
     header["FFTTYPE"] = ("matrix Fourier", "Algorithm for FFTs: numpy or fftw")
     header["NORMALIZ"] = (normalize, "PSF normalization method")
     set_keyword(header, "DRVERS", __version__)
-    set_keyword(header, "DRPROP", _propagations(system))
+    # How a system that was made from poppy's propagates through each image plane.
+    used = getattr(system, "propagation", {})
+    propagations = ", ".join(f"{name}: {kind}" for name, kind in used.items())
+    set_keyword(header, "DRPROP", propagations or "compact")
     set_keyword(header, "DRPREC", str(entrance.dtype).removeprefix("torch."))
     header.add_history(f"Created by pyklip_diffrender {__version__}")
 

@@ -29,7 +29,7 @@ from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.io.units import to_arcsec
-from pyklip_diffrender.optics.convolution import fft_convolve
+from pyklip_diffrender.optics.grid import fft_convolve
 from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.star_place import without_gaps

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pyklip_diffrender.instrument.masks import BEYOND_MASK_ARCSEC
 from pyklip_diffrender.linear.model import LinearModel, TemplateProducts
-from pyklip_diffrender.optics.convolution import fft_convolve
+from pyklip_diffrender.optics.grid import fft_convolve
 from pyklip_diffrender.refinement.forward import Objective, State, pixel_grid
 from pyklip_diffrender.scene.objects import Planet
 

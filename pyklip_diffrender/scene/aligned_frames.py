@@ -19,7 +19,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.headers import header_number, header_text
 from pyklip_diffrender.io.units import native_float64, require_finite
-from pyklip_diffrender.optics.convolution import fft_convolve
+from pyklip_diffrender.optics.grid import fft_convolve
 from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask
 from pyklip_diffrender.scene.star_place import measured_offset
 

@@ -11,11 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pyklip_diffrender.errors import (
-    CorruptFileError,
-    IncompatibleSetupError,
-    NoValidPixelsError,
-)
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.files import fits_files, read_text
 
 _log = logging.getLogger(__name__)

@@ -22,11 +22,7 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.io.files import read_image
 from pyklip_diffrender.io.headers import card_error, header_number, header_text, merged_header
 from pyklip_diffrender.io.units import ARCSEC, native_float64
-from pyklip_diffrender.scene.aligned_frames import (
-    SHIFTS,
-    first_pixel,
-    recorded_shifts,
-)
+from pyklip_diffrender.scene.aligned_frames import SHIFTS, first_pixel, recorded_shifts
 from pyklip_diffrender.scene.exposure import beginning, detector_of, middle, position_angle
 from pyklip_diffrender.scene.integrations import (
     Judgement,
@@ -113,12 +109,7 @@ def read_calints(
     # A star whose position is stated was moved, unless the file has shifts not yet applied.
     records = any(key in hdus for key in SHIFTS)
     moved = "STARCENX" in header and not records
-    arguments = {
-        "data": data,
-        "error": error,
-        "valid": valid,
-        **details,
-    }
+    arguments = {"data": data, "error": error, "valid": valid, **details}
     if mask is not None:
         # spaceKLIP records the star's position minus the mask's, in pixels, for every integration.
         offset = native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
@@ -158,8 +149,8 @@ def without_empty(
 
     The last value says which integrations are kept; None for all.
     """
-    stacks = [np.asarray(arguments[key]) for key in ("data", "error", "valid")]
-    data, error, valid = (each[None] if each.ndim == 2 else each for each in stacks)
+    arrays = [np.asarray(arguments[key]) for key in ("data", "error", "valid")]
+    data, error, valid = (each[None] if each.ndim == 2 else each for each in arrays)
     if data.ndim != 3 or not data.shape == error.shape == valid.shape:
         return arguments, shifts, None
     judgement = empty_integrations(data, map(usable_pixels, data, error, valid))
@@ -171,11 +162,8 @@ def without_empty(
     for remark in remarks:
         _log.warning("%s: %s", name, remark)
     kept = judgement.kept
-    changed = {
-        "data": compressed(data, kept),
-        "error": compressed(error, kept),
-        "valid": compressed(valid, kept),
-    }
+    stacks = {"data": data, "error": error, "valid": valid}
+    changed = {key: compressed(stack, kept) for key, stack in stacks.items()}
     if arguments["position_angles"] is not None:
         changed["position_angles"] = arguments["position_angles"][kept]
     return arguments | changed, None if shifts is None else shifts[kept], judgement

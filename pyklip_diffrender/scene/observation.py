@@ -17,13 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.io.units import (
-    full_circle,
-    half_circle,
-    rotation_matrix,
-    to_mask,
-    to_unit,
-)
+from pyklip_diffrender.io.units import full_circle, half_circle, rotation_matrix, to_mask, to_unit
 from pyklip_diffrender.scene.aligned_frames import on_detector_pixels
 from pyklip_diffrender.scene.exposure import instrument_of, star_of
 from pyklip_diffrender.scene.integrations import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -100,16 +100,6 @@ class Row:
 _COLUMN_UNITS = {
     "position_angle": u.deg, "ra": u.deg, "dec": u.deg, "offset_x": u.arcsec, "offset_y": u.arcsec,
 }  # fmt: skip
-
-
-def rows_table(rows: Sequence[Row]) -> QTable:
-    """Make the table; see `pyklip_diffrender.ExposureSequence.table`."""
-    values = [row.values() for row in rows]
-    table = QTable({name: [each[name] for each in values] for name in values[0]})
-    for name, unit in _COLUMN_UNITS.items():
-        table[name] = np.asarray(table[name], dtype=float) * unit
-    table["position_angle"].info.format = ".2f"
-    return table
 
 
 _SAME_WINDOW_PIXELS = 2
@@ -436,7 +426,12 @@ class ExposureSequence:
         does not state them.
         """
         rows = self.rows or (*_rows("target", self.science), *_rows("reference", self.references))
-        return rows_table(rows)
+        values = [row.values() for row in rows]
+        table = QTable({name: [each[name] for each in values] for name in values[0]})
+        for name, unit in _COLUMN_UNITS.items():
+            table[name] = np.asarray(table[name], dtype=float) * unit
+        table["position_angle"].info.format = ".2f"
+        return table
 
     def windows(self, shape: tuple[int, int]) -> tuple[tuple[Window, ...], tuple[Window, ...]]:
         """Boxes of `shape` about the star, one for each observation of target and references.

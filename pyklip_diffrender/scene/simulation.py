@@ -198,9 +198,13 @@ def images_of_stars(
     model = model_for(observation, size, nlambda=1, npix=npix)
     # Without a wavefront error the star would be too faint.
     wavefront = random_opd(1, npix=npix)
+    return _image(model, wavefront, (0.0, 0.0)), _image(model, wavefront, (0.0, away))
+
+
+def _image(model: OpticalSystem, opd: Any, offset: tuple[float, float]) -> NDArray[np.float64]:
+    """Image (ny, nx) of a point source at x, y from the occulter, arcsec, without derivatives."""
     with torch.no_grad():
-        images = [model(wavefront, (0.0, y)).double().cpu().numpy() for y in (0.0, away)]
-    return images[0], images[1]
+        return np.asarray(model(opd, offset).double().cpu().numpy())
 
 
 # Simulated observations: the model's image of a scene, with shot and read noise.
@@ -226,19 +230,15 @@ def require_imaged(model: OpticalSystem, planets: Iterable[Planet], name: str) -
 
 def star_photons(model: OpticalSystem, scene: Scene, opd: Any) -> NDArray[np.float64]:
     """Expected photons of the star alone, (ny, nx)."""
-    with torch.no_grad():
-        image = model(opd, scene.star_offset)
-    return scene.star.photons * image.double().cpu().numpy()
+    return scene.star.photons * _image(model, opd, scene.star_offset)
 
 
 def planet_photons(
     model: OpticalSystem, scene: Scene, planet: Planet, opd: Any
 ) -> NDArray[np.float64]:
     """Expected photons of one planet, seen through the mask where it is, (ny, nx)."""
-    offset = np.add(scene.star_offset, planet.offset)
-    with torch.no_grad():
-        image = model(opd, tuple(offset))
-    return planet.contrast * scene.star.photons * image.double().cpu().numpy()
+    x, y = np.add(scene.star_offset, planet.offset)
+    return planet.contrast * scene.star.photons * _image(model, opd, (x, y))
 
 
 def expected_photons(model: OpticalSystem, scene: Scene, opd: Any) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.jwst import TABULATED_GAP, is_jwst_pupil, jwst_segments
+from pyklip_diffrender.instrument.masks import TABULATED_GAP, is_jwst_pupil, jwst_segments
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
 from pyklip_diffrender.optics.planes import EntrancePupil
 
@@ -68,29 +68,25 @@ class SegmentMotions:
         return torch.zeros(len(self), dtype=torch.float64)
 
     def modes(self, grid: PupilGrid, start: int, stop: int) -> Tensor:
-        segments = _sampled_segments(_whole(grid))
+        segments = _sampled_segments(grid.npix, grid.diameter)
         return torch.stack(
             [segments[k // 3][0].crop(segments[k // 3][1][k % 3], grid) for k in range(start, stop)]
         )
 
     def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
         total = torch.zeros(grid.shape, dtype=torch.float64)
-        for (window, modes), motion in zip(
-            _sampled_segments(_whole(grid)), coefficients.reshape(-1, 3), strict=True
-        ):
+        segments = _sampled_segments(grid.npix, grid.diameter)
+        for (window, modes), motion in zip(segments, coefficients.reshape(-1, 3), strict=True):
             rigid = torch.tensordot(motion, modes, dims=1)
             total = total + window.crop(rigid, grid)
         return total
 
 
-def _whole(grid: PupilGrid) -> PupilGrid:
-    """The full grid, so that modes do not depend on the part of a segment that `grid` covers."""
-    return PupilGrid.full(grid.npix, grid.diameter)
-
-
 @lru_cache(maxsize=4)
-def _sampled_segments(grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
+def _sampled_segments(npix: int, diameter: float) -> list[tuple[PupilGrid, Tensor]]:
     """For each segment the window that holds it and its three modes there."""
+    # On the full grid, so that modes do not depend on the part of a segment that a window covers.
+    grid = PupilGrid.full(npix, diameter)
     reach = max(float(outline.abs().max()) for outline in jwst_segments().values())
     if 2 * reach > 1.01 * grid.diameter:
         raise IncompatibleSetupError(
@@ -134,7 +130,8 @@ class FourierModes:
         # MASKRND's narrow openings spread light over 11 lambda/D, so a field of 5 arcsec at 4.5 um
         # is sensitive to frequencies up to about 24.
         self.max_cycles, self.min_cycles = float(max_cycles), float(min_cycles)
-        reach = math.floor(max_cycles)
+        # `reach` is the largest number of cycles along an axis.
+        self.reach = reach = math.floor(max_cycles)
         # One of each two opposite frequencies, whose cosine and sine are the same but for a sign.
         pairs = [
             (fx, fy)
@@ -144,7 +141,6 @@ class FourierModes:
         ]
         pairs.sort(key=lambda pair: (pair[0] ** 2 + pair[1] ** 2, pair))
         self.cycles = torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2)
-        self._reach = reach
 
     def __len__(self) -> int:
         return 2 * len(self.cycles)
@@ -152,11 +148,6 @@ class FourierModes:
     @property
     def group_index(self) -> Tensor:
         return torch.zeros(len(self), dtype=torch.int64)
-
-    @property
-    def reach(self) -> int:
-        """Largest number of cycles along an axis."""
-        return self._reach
 
     @property
     def frequencies(self) -> Tensor:
@@ -176,7 +167,7 @@ class FourierModes:
 
     def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
         # sum c cos + s sin = Re sum (c - i s) exp(i ...): two small matrix products.
-        reach = self._reach
+        reach = self.reach
         table = torch.zeros(reach + 1, 2 * reach + 1, dtype=torch.complex128)
         pairs = coefficients.double().reshape(-1, 2)
         table = table.index_put(

@@ -8,7 +8,6 @@ import math
 import os
 import warnings
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,13 +29,13 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.instrument.jwst import jwst_pupil
+from pyklip_diffrender.instrument.masks import jwst_pupil
 from pyklip_diffrender.io.files import BROKEN, fits_files, open_fits, product_in, sha256
 from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
 from pyklip_diffrender.io.units import native_float64, to_metres, to_number, warn_of_rms
 from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
-from pyklip_diffrender.wavefront.opd_map import FLAT, OPDMap
+from pyklip_diffrender.wavefront.opd_map import FLAT, OPDMap, length_unit
 from pyklip_diffrender.wavefront.wss import (
     EXTENSION,
     analysis_of,
@@ -126,12 +125,10 @@ def read_opd(
             f"{path.name}: the header has no BUNIT. Give the unit: read_opd(path, unit='m') "
             "(or 'um', 'nm')"
         )
-    try:
-        # STScI writes "meters", "microns".
-        spelled = str(unit).strip().rstrip("s").lower() if isinstance(unit, str) else unit
-        data = raw * u.Unit(spelled).to(u.m)
-    except (ValueError, u.UnitConversionError) as error:
-        raise UnitError(f"{path.name}: BUNIT is {unit!r}, expected a unit of length") from error
+    length = length_unit(unit)
+    if length is None:
+        raise UnitError(f"{path.name}: BUNIT is {unit!r}, expected a unit of length")
+    data = raw * length.to(u.m)
     date = sensing_date(header, path.name)
     return _checked(OPDMap(data, date, path.name, sha256(path), path=path))
 
@@ -198,12 +195,9 @@ def _require_wavefront(
     )
 
 
-@lru_cache(maxsize=8)
 def _inside(npix: int) -> NDArray[np.bool_]:
-    """Samples inside the pupil; cached because this takes as long as reading a map."""
-    inside: NDArray[np.bool_] = jwst_pupil(npix).numpy() > 0.5
-    inside.setflags(write=False)
-    return inside
+    """Samples inside the pupil."""
+    return np.asarray(jwst_pupil(npix).numpy() > 0.5)
 
 
 def _checked(raw: OPDMap) -> OPDMap:
@@ -365,7 +359,11 @@ def choose_opd(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     notes = [f"{opd.name}, {opd.age(when)}" for opd in chosen]
     for opd in chosen:
         _warn_if_outdated(opd, when)
-    opd = chosen[0] if len(chosen) == 1 else _interpolated(chosen[0], chosen[1], when)
+    opd = chosen[0]
+    if len(chosen) == 2:
+        npix = max(each.shape[0] for each in chosen)
+        first, last = (replace(each, data=resample(each.data, npix)) for each in chosen)
+        opd = interpolate_wss(first, last, when)
     note = f"{rule} of {len(maps)} maps: {', '.join(notes)} {when.isot[:19]}"
     _log.info("OPD map %s", note)
     replaced = [
@@ -465,25 +463,12 @@ def _date_of_map(path: Path) -> Time:
         if reason:
             raise LookupError(reason)
     unit = header_text(header, "BUNIT", path.name)
-    if not (sensed or _is_length(unit)):
+    if not sensed and length_unit(unit or "") is None:
         raise LookupError(f"its image is not an OPD map: BUNIT is {unit!r}")
     date = sensing_date(header, path.name)
     if date is None:
         raise LookupError("it has no date in its header nor in its name")
     return date
-
-
-def _is_length(unit: str | None) -> bool:
-    try:
-        return bool(u.Unit((unit or "").strip().rstrip("s").lower()).is_equivalent(u.m))
-    except ValueError:
-        return False
-
-
-def _interpolated(before: OPDMap, after: OPDMap, when: Time) -> OPDMap:
-    npix = max(before.shape[0], after.shape[0])
-    before, after = (replace(opd, data=resample(opd.data, npix)) for opd in (before, after))
-    return interpolate_wss(before, after, when)
 
 
 def _warn_if_outdated(opd: OPDMap, when: Time) -> None:

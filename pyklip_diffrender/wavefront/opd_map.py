@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy import units as u
 from astropy.io import fits
 from astropy.time import Time
 from numpy.typing import NDArray
@@ -67,6 +68,14 @@ class OPDMap:
         """Text for `days_after`, such as "3.2 days before"; empty if the map has no date."""
         days = self.days_after(date)
         return "" if days is None else f"{abs(days):.1f} days {'after' if days > 0 else 'before'}"
+
+
+def length_unit(unit: str | u.UnitBase) -> u.UnitBase | None:
+    """The unit of a map; None if it is not one of length."""
+    # STScI writes "meters", "microns".
+    spelled = unit.strip().rstrip("s").lower() if isinstance(unit, str) else unit
+    known = u.Unit(spelled, parse_strict="silent")
+    return known if known.is_equivalent(u.m) else None
 
 
 # Plausibility checks of OPD maps, and their export as HDULists for poppy and stpsf.

@@ -28,20 +28,17 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     MissingOPDError,
 )
-from pyklip_diffrender.instrument.jwst import jwst_pupil
+from pyklip_diffrender.instrument.masks import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_text, sensing_date
 from pyklip_diffrender.io.units import native_float64, require_shape
-from pyklip_diffrender.wavefront.opd_map import OPDMap, check_opd
+from pyklip_diffrender.wavefront.opd_map import OPDMap, check_opd, length_unit
 
 # The aberrations that a wavefront-sensing map contains besides the telescope's, by stpsf's models.
 #
 # stpsf and its data (``STPSF_PATH``) are optional, and imported when they are first used.
 
 Array = NDArray[np.float64]
-
-TO_METRES = {"um": 1e-6, "micron": 1e-6, "microns": 1e-6, "m": 1.0, "meter": 1.0, "nm": 1e-9}
-"""Units of maps, as the files spell them, in metres."""
 
 
 def stpsf_module(purpose: str) -> Any:
@@ -217,7 +214,8 @@ def load_wss_opd(
         # MAST's files are in microns and do not say so.
         unit = header_text(hdus[EXTENSION].header, "BUNIT", path.name) or "micron"
     require_shape(coarse, (None, None), f"{path}: {EXTENSION}", "It must be an image")
-    if unit.strip().lower() not in TO_METRES:
+    length = length_unit(unit)
+    if length is None:
         raise IncompatibleSetupError(f"{path}: {EXTENSION} has BUNIT={unit!r}, expected 'micron'")
     if not coarse.any():
         raise CorruptFileError(
@@ -227,7 +225,7 @@ def load_wss_opd(
     npix = npix or finest_pupil()
     aperture = header_text(header, "APERNAME", path.name) or ""
     pupil = pupil_samples(npix, required=backout_si_wfe is True)
-    opd = _interpolated(_gaps_filled(coarse), npix) * TO_METRES[unit.strip().lower()]
+    opd = _interpolated(_gaps_filled(coarse), npix) * length.to(u.m)
     history = [
         f"{path.name} sha256 {sha256(path)}",
         f"gaps filled, interpolated from {len(coarse)} to {npix} samples, {unit} to m, masked",
