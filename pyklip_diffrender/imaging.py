@@ -244,10 +244,7 @@ class SkyModel:
         `light` is data minus star, (k, ny, nx) by frame; by default from the fit.
         """
         images = self.light() if light is None else light
-        return self._seen(self._prior * self._solved(self._prior * self._collected(images)))
-
-    def _seen(self, sources: Image) -> Image:
-        """Images of point sources as the beam shows them."""
+        sources = self._prior * self._solved(self._prior * self._collected(images))
         return self._filtered(sources, self._beam)
 
     def _filtered(self, images: Image, transform: Image) -> Image:
@@ -274,8 +271,8 @@ class SkyModel:
         signs = inside * np.random.default_rng(seed).choice(
             [-1.0, 1.0], (_ERROR_PROBES, *self.shape)
         )
-        once = self._solved(self._prior * self._seen(signs))
-        covariance = self._seen(self._prior * (once - self._solved(once)))
+        once = self._solved(self._prior * self._filtered(signs, self._beam))
+        covariance = self._filtered(self._prior * (once - self._solved(once)), self._beam)
         distance = np.hypot(*np.moveaxis(self.grid, -1, 0)) / self.resolution
         variance = (signs * covariance).mean(axis=0)[inside]
         variance = _by_ring(variance, distance[inside], distance)

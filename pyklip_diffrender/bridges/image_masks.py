@@ -517,16 +517,15 @@ def _surroundings(
     def rows(y: Tensor) -> Tensor:
         return (y - y0 > 10).double() + 0.3 * _between(-13.0, -11.5, y0)(y)
 
+    def side(y: Tensor) -> Tensor:
+        """Rows that only the side of the holder covers."""
+        return ((y - y0 > -11.5) & ~(y - y0 > 10)).double()
+
     parts = [
         Part(along_x=squares(large), along_y=_between(-10.0, -5.0, y0)),
         Part(along_x=squares(small), along_y=_between(8.0, 10.0, y0)),
         Part(along_y=rows),
     ]
     if edge is not None:
-        parts.append(Part(along_x=held, along_y=lambda y: _side(y - y0)))
+        parts.append(Part(along_x=held, along_y=side))
     return parts
-
-
-def _side(y: Tensor) -> Tensor:
-    """Rows that only the side of the holder covers."""
-    return ((y > -11.5) & ~(y > 10)).double()

@@ -551,10 +551,36 @@ class Reading:
 
         The response follows changes in the last pupil, and is right until the next call.
         """
-        response, error = self._cache.response_within(
-            opd, values, self._allowed, self._keep, stores=not self._is_last
+        cache = self._cache
+        inside = opd[cache.model.entrance.lit]
+        near = cache.nearest(
+            cache.responses, inside, values, _RESPONSE_ERROR_PER_RADIAN, self._allowed
         )
-        self.farthest = max(self.farthest, error)
+        if near is not None:
+            about, response, error = near
+            self.farthest = max(self.farthest, error)
+            if cache.last_pupil.change(about.now, values) > _UNFOLLOWED_RADIANS:
+                response.follow(cache.last_pupil, values)
+                about.now = dict(values)
+            return response
+        # Unknowns whose effects nearly cancel need derivatives of the same field.
+        cache.slopes.clear()
+        # Memory is freed first, because the new response is as large as the old one.
+        del cache.responses[: max(0, len(cache.responses) + 1 - self._keep)]
+        response = WavefrontResponse(
+            cache.model,
+            cache.basis,
+            opd,
+            values,
+            npix=cache.npix,
+            wavelengths=cache.wavelengths,
+            stored=False,
+            progress=cache.progress,
+        )
+        if not self._is_last and response.size <= cache.memory:
+            cache.make_room(response.size)
+            response.store()
+        cache.responses.append((_About(inside, dict(values), dict(values)), response))
         return response
 
     def parameters(
@@ -569,9 +595,22 @@ class Reading:
         `opd` is (npix, npix) on the model's grid, m, and `fields` are the fields of the star by the
         cache's model `few`. The names must not change between calls.
         """
-        slopes, error = self._cache.slopes_within(opd, values, names, self._allowed, self._keep)
-        self.farthest = max(self.farthest, error)
-        return image_derivatives(self._cache.coarse, fields, values, names, slopes)
+        cache = self._cache
+        inside = opd[cache.model.entrance.lit]
+        near = cache.nearest(cache.slopes, inside, values, _SLOPE_ERROR_PER_RADIAN, self._allowed)
+        if near is not None:
+            about, slopes, error = near
+            self.farthest = max(self.farthest, error)
+            if cache.last_pupil.change(about.now, values) > _UNFOLLOWED_RADIANS:
+                for slope in slopes.values():
+                    cache.last_pupil.multiply(slope, about.now, values)
+                about.now = dict(values)
+        else:
+            del cache.slopes[: max(0, len(cache.slopes) + 1 - self._keep)]
+            coarse = downsample(opd, cache.coarse.npix)
+            slopes = field_derivatives(cache.coarse, coarse, values, names)
+            cache.slopes.append((_About(inside, dict(values), dict(values)), slopes))
+        return image_derivatives(cache.coarse, fields, values, names, slopes)
 
 
 class ResponseCache:
@@ -594,76 +633,16 @@ class ResponseCache:
     ) -> None:
         self.model, self.basis, self.npix, self.wavelengths = model, basis, npix, wavelengths
         self.memory, self.progress = memory, progress
-        self._kept: list[tuple[_About, WavefrontResponse]] = []
-        self._slopes: list[tuple[_About, dict[str, list[Tensor]]]] = []
+        self.responses: list[tuple[_About, WavefrontResponse]] = []
+        self.slopes: list[tuple[_About, dict[str, list[Tensor]]]] = []
+        """Derivatives of the field by parameters, see `field_derivatives`."""
         self.few = at_few_wavelengths(model, wavelengths)
         """The model at the wavelengths of the derivatives, which gives the field of the star."""
         self.coarse = coarse_copy(self.few, npix)
         """The coarse model that is differentiated by parameters."""
-        self._last_pupil = LastPupil(self.coarse)
+        self.last_pupil = LastPupil(self.coarse)
 
-    def slopes_within(
-        self,
-        opd: Tensor,
-        values: dict[str, Tensor],
-        names: tuple[str, ...],
-        allowed: float,
-        keep: int,
-    ) -> tuple[dict[str, list[Tensor]], float]:
-        """Derivatives of the field by parameters, and the error of them; see `Reading`."""
-        inside = opd[self.model.entrance.lit]
-        near = self._nearest(self._slopes, inside, values, _SLOPE_ERROR_PER_RADIAN, allowed)
-        if near is not None:
-            about, slopes, error = near
-            if self._last_pupil.change(about.now, values) > _UNFOLLOWED_RADIANS:
-                for fields in slopes.values():
-                    self._last_pupil.multiply(fields, about.now, values)
-                about.now = dict(values)
-            return slopes, error
-        del self._slopes[: max(0, len(self._slopes) + 1 - keep)]
-        slopes = field_derivatives(self.coarse, downsample(opd, self.coarse.npix), values, names)
-        self._slopes.append((_About(inside, dict(values), dict(values)), slopes))
-        return slopes, 0.0
-
-    def response_within(
-        self,
-        opd: Tensor,
-        values: dict[str, Tensor],
-        allowed: float,
-        keep: int,
-        *,
-        stores: bool = True,
-    ) -> tuple[WavefrontResponse, float]:
-        """The response for nearly the same field, and the error of it; see `Reading`."""
-        inside = opd[self.model.entrance.lit]
-        near = self._nearest(self._kept, inside, values, _RESPONSE_ERROR_PER_RADIAN, allowed)
-        if near is not None:
-            about, response, error = near
-            if self._last_pupil.change(about.now, values) > _UNFOLLOWED_RADIANS:
-                response.follow(self._last_pupil, values)
-                about.now = dict(values)
-            return response, error
-        # Unknowns whose effects nearly cancel need derivatives of the same field.
-        self._slopes.clear()
-        # Memory is freed first, because the new response is as large as the old one.
-        del self._kept[: max(0, len(self._kept) + 1 - keep)]
-        response = WavefrontResponse(
-            self.model,
-            self.basis,
-            opd,
-            values,
-            npix=self.npix,
-            wavelengths=self.wavelengths,
-            stored=False,
-            progress=self.progress,
-        )
-        if stores and response.size <= self.memory:
-            self._make_room(response.size)
-            response.store()
-        self._kept.append((_About(inside, dict(values), dict(values)), response))
-        return response, 0.0
-
-    def _nearest(
+    def nearest(
         self,
         kept: Sequence[tuple[_About, _Derivatives]],
         opd: Tensor,
@@ -677,9 +656,9 @@ class ResponseCache:
             return None
         return *kept[errors.index(min(errors))], min(errors)
 
-    def _make_room(self, size: int) -> None:
+    def make_room(self, size: int) -> None:
         """Free the oldest responses until `size` bytes can be stored."""
-        stored = [response for _, response in self._kept if response.stored]
+        stored = [response for _, response in self.responses if response.stored]
         while stored and sum(each.size for each in stored) + size > self.memory:
             stored.pop(0).forget()
 
@@ -699,14 +678,14 @@ class ResponseCache:
         lever = wavenumber * ARCSEC * self.model.diameter / 4
         parts = [
             float((wavenumber * (opd - about.opd).abs()).square().mean().sqrt()),
-            _FOLLOWED_ERROR_PER_RADIAN * self._last_pupil.change(about.values, values),
+            _FOLLOWED_ERROR_PER_RADIAN * self.last_pupil.change(about.values, values),
         ]
         for name, sensitivity in (
             ("star_offset", tilt * lever),
             ("lyot_shift", _FIELD_CHANGE_PER_STOP_DIAMETER),
             ("lyot_rotation", _FIELD_CHANGE_PER_STOP_DIAMETER * math.radians(1) / 4),
             # Derivatives cannot follow an aberration in another pupil.
-            ("si_zernikes", 0.0 if self._last_pupil.zernikes else wavenumber),
+            ("si_zernikes", 0.0 if self.last_pupil.zernikes else wavenumber),
         ):
             parts.append(sensitivity * float(difference(name).norm()))
         return math.hypot(*parts)
