@@ -352,27 +352,10 @@ def mask_of_header(value: object) -> str:
     return re.sub(r"^MASK[AB](?=\d|[LS]WB)", "MASK", str(value).strip().upper())
 
 
-# The filters' substrates and the coronagraph's wedge displace the image by up to two pixels.
-# J. Leisenring's measurements in flight with module A, as in spaceKLIP's resources
-# filter_shifts_jarron.json (commit 07eaf7d).
-_SHIFTS = {
-    "F182M": (-0.071, -1.365),
-    "F187N": (-0.108, -1.216),
-    "F200W": (2.543, 4.119),
-    "F210M": (0.0, 0.0),
-    "F212N": (0.037, 0.344),
-    "F250M": (0.056, -2.038),
-    "F300M": (0.086, -0.526),
-    "F322W2": (0.198, -0.583),
-    "F335M": (0.0, 0.0),
-    "F356W": (0.783, -0.159),
-    "F360M": (0.204, -0.087),
-    "F410M": (0.209, -0.132),
-    "F430M": (0.196, -0.182),
-    "F444W": (0.177, -0.205),
-    "F460M": (0.237, -0.766),
-    "F480M": (0.226, -0.899),
-}
+@lru_cache(maxsize=1)
+def _shifts() -> dict[str, tuple[float, float]]:
+    table = embedded_table("nircam_filter_shifts")
+    return {str(row["filter"]): (float(row["x"]), float(row["y"])) for row in table}
 
 
 def filter_shift(name: str) -> tuple[float, float]:
@@ -381,8 +364,9 @@ def filter_shift(name: str) -> tuple[float, float]:
     x, y in pixels of the filter's channel, science frame; short-wave filters are relative to F210M.
     IncompatibleSetupError for a filter whose shift was not measured.
     """
-    if name.upper() not in _SHIFTS:
+    shifts = _shifts()
+    if name.upper() not in shifts:
         raise IncompatibleSetupError(
-            f"filter: the image shift was measured for {', '.join(_SHIFTS)}, not for {name!r}"
+            f"filter: the image shift was measured for {', '.join(shifts)}, not for {name!r}"
         )
-    return _SHIFTS[name.upper()]
+    return shifts[name.upper()]

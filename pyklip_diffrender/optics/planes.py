@@ -552,10 +552,18 @@ class Detector:
 
     def image(self, intensity: Tensor, values: Values) -> Tensor:
         """Pixel values (..., ny, nx) from the intensity on the samples: blur, then binning."""
+        return self._binned(self._blurred(intensity, values))
+
+    def _blurred(self, intensity: Tensor, values: Values) -> Tensor:
+        """Samples with a free blur, if any."""
         if "blur" in values:
             for axis, scale in ((-1, self.pixelscale[0]), (-2, self.pixelscale[1])):
                 sigma = values["blur"].reshape(()) * (self.oversample / scale)
                 intensity = _blur(intensity, sigma, axis)
+        return intensity
+
+    def _binned(self, intensity: Tensor) -> Tensor:
+        """Pixels of samples."""
         if self.oversample == 1:
             return intensity
         ny, nx = self.shape
@@ -686,20 +694,10 @@ class ChainDetector(Detector):
 
     def image(self, intensity: Tensor, values: Values) -> Tensor:
         """See `Detector.image`; a free blur comes before the other effects."""
-        if "blur" in values:
-            # Blur the samples without binning them.
-            shape, oversample = self.shape, self.oversample
-            fine = Detector(
-                (shape[0] * oversample, shape[1] * oversample),
-                (self.pixelscale[0] / oversample, self.pixelscale[1] / oversample),
-                1,
-                self.dtype,
-                self.device,
-            )
-            intensity = fine.image(intensity, {"blur": values["blur"]})
+        intensity = self._blurred(intensity, values)
         for effect in self.on_samples:
             intensity = effect(intensity)
-        image = super().image(intensity, {k: v for k, v in values.items() if k != "blur"})
+        image = self._binned(intensity)
         for effect in self.on_pixels:
             image = effect(image)
         return image
