@@ -21,6 +21,7 @@ from pyklip_diffrender.bridges.image_masks import (
     ImageSamples,
     MaskPart,
     MaskStack,
+    Part,
     SampledOcculter,
     SeparablePart,
     complement_box,
@@ -273,8 +274,7 @@ class Conversion:
         parts: list[MaskPart] = []
         for part in mask_parts:
             if part.box is None:
-                along_x = _turned_factor(part.along_x, part.along_y, to_plane, 0)
-                along_y = _turned_factor(part.along_x, part.along_y, to_plane, 1)
+                along_x, along_y = (_turned_factor(part, to_plane, axis) for axis in (0, 1))
                 parts.append(SeparablePart(along_x, along_y, self.sampling))
                 continue
             low, high, bottom, top = part.box
@@ -358,14 +358,11 @@ class Conversion:
 
 
 def _turned_factor(
-    along_x: Callable[[Tensor], Tensor] | None,
-    along_y: Callable[[Tensor], Tensor] | None,
-    to_plane: Orientation,
-    axis: int,
+    part: Part, to_plane: Orientation, axis: int
 ) -> Callable[[Tensor], Tensor] | None:
     """The factor of a separable part along one axis of the final image."""
     # Turns are by right angles, so that an axis of the image is, up to the sign, an axis of the
     # plane: one element of the column of the matrix is not 0.
     column = (to_plane.matrix[0][axis], to_plane.matrix[1][axis])
-    factor, sign = (along_x, column[0]) if column[0] else (along_y, column[1])
+    factor, sign = (part.along_x, column[0]) if column[0] else (part.along_y, column[1])
     return None if factor is None else lambda positions: factor(sign * positions)

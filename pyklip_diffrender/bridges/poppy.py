@@ -28,38 +28,6 @@ from pyklip_diffrender.optics.system import REFUSED, OpticalSystem
 Array = NDArray[Any]
 
 
-def intermediate_wavefronts(
-    system: PoppySystem,
-    normalize: str,
-    opd: Any,
-    parameters: Mapping[str, Any],
-    only_last: bool,
-) -> list[poppy.Wavefront]:
-    """Fields as `poppy.Wavefront`, one per plane, weighted and summed as poppy does.
-
-    The field of an image plane is the field behind the mask on the sampled part of the image.
-    `normalize` must be "first". With `only_last`, there is the field on the detector alone.
-    """
-    if normalize.lower() != "first":
-        raise IncompatibleSetupError(
-            f"normalize={normalize!r}: intermediate wavefronts come with 'first' only"
-        )
-    summed: list[poppy.Wavefront] = []
-    tensor, values = system.opd(opd), system.values(parameters)
-    for wavelength, weight in zip(
-        system.bandpass.wavelengths, system.bandpass.weights, strict=True
-    ):
-        for k, wave in enumerate(_wavefronts(system, tensor, values, wavelength, only_last)):
-            wave.wavefront = wave.wavefront * weight
-            if k == len(summed):
-                summed.append(wave)
-            elif summed[k].shape == wave.shape:
-                summed[k].wavefront = summed[k].wavefront + wave.wavefront
-            # Otherwise an image plane, sampled in proportion to the wavelength, has another number
-            # of samples; the field at the first wavelength is kept.
-    return summed
-
-
 def _wavefronts(
     system: PoppySystem, opd: Tensor, values: Values, wavelength: float, only_last: bool
 ) -> list[poppy.Wavefront]:
@@ -181,8 +149,29 @@ class PoppySystem(OpticalSystem):
     def _intermediates(
         self, normalize: str, opd: Any, parameters: Mapping[str, Any], only_last: bool
     ) -> list[poppy.Wavefront]:
-        """See `intermediate_wavefronts`."""
-        return intermediate_wavefronts(self, normalize, opd, parameters, only_last)
+        """Fields as `poppy.Wavefront`, one per plane, weighted and summed as poppy does.
+
+        The field of an image plane is the field behind the mask on the sampled part of the image.
+        `normalize` must be "first". With `only_last`, there is the field on the detector alone.
+        """
+        if normalize.lower() != "first":
+            raise IncompatibleSetupError(
+                f"normalize={normalize!r}: intermediate wavefronts come with 'first' only"
+            )
+        summed: list[poppy.Wavefront] = []
+        tensor, values = self.opd(opd), self.values(parameters)
+        for wavelength, weight in zip(
+            self.bandpass.wavelengths, self.bandpass.weights, strict=True
+        ):
+            for k, wave in enumerate(_wavefronts(self, tensor, values, wavelength, only_last)):
+                wave.wavefront = wave.wavefront * weight
+                if k == len(summed):
+                    summed.append(wave)
+                elif summed[k].shape == wave.shape:
+                    summed[k].wavefront = summed[k].wavefront + wave.wavefront
+                # Otherwise an image plane, sampled in proportion to the wavelength, has another
+                # number of samples; the field at the first wavelength is kept.
+        return summed
 
     def display(self, **keywords: Any) -> None:
         """Draw all planes as poppy does, with the keywords of `display` of its optics."""

@@ -406,7 +406,10 @@ class LatticeRoute:
 
     def __init__(self, planes: Sequence[Plane], detector: Detector) -> None:
         self.planes, self.detector = tuple(planes), detector
-        (self._place,) = (k for k, p in enumerate(planes) if isinstance(p, CompactOcculter))
+        found = [(k, p) for k, p in enumerate(planes) if isinstance(p, CompactOcculter)]
+        ((self._place, self.occulter),) = found
+        # Smallest number of cells per lambda/D.
+        self.sampling = self.occulter.sampling or DEFAULT_SAMPLING
         behind = planes[self._place + 1 :]
         self._moving = {name for plane in behind for name in plane.parameters} | {"detector_shift"}
         self._lattices: Cache[tuple[float, bool], OcculterLattice] = Cache()
@@ -419,18 +422,6 @@ class LatticeRoute:
         """Whether the planes are one `CompactOcculter` and otherwise factors in pupils."""
         others = [plane for plane in planes if not isinstance(plane, CompactOcculter)]
         return len(planes) - len(others) == 1 and all(plane.pointwise for plane in others)
-
-    @property
-    def occulter(self) -> CompactOcculter:
-        """The occulter among the planes."""
-        plane = self.planes[self._place]
-        assert isinstance(plane, CompactOcculter)
-        return plane
-
-    @property
-    def sampling(self) -> float:
-        """Smallest number of cells per lambda/D."""
-        return self.occulter.sampling or DEFAULT_SAMPLING
 
     def pays(self, wavelengths: Sequence[float]) -> bool:
         """Whether the cells aligned with the detector are not much finer than necessary."""

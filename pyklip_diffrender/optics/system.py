@@ -293,24 +293,18 @@ class OpticalSystem(Propagation):
         refuse_keywords(self._refused, locals())
         if source is not None:
             wavelength, weight = source["wavelengths"], source["weights"]
-        system = self
+        system: Any = self
         if wavelength is not None or weight is not None:
             waves = self.bandpass.wavelengths if wavelength is None else wavelength
             system = self.at_wavelengths(Bandpass.of(waves, weight))
         wavefronts = None
-        if return_intermediates or return_final:
+        if return_intermediates or return_final:  # Systems without these have refused them.
             only_last = not return_intermediates
             wavefronts = system._intermediates(normalize, opd, parameters, only_last)
         hdus = poppy_psf(system, normalize, opd, **parameters)
         if display:
             system._draw_psf(hdus, parameters)
         return hdus if wavefronts is None else (hdus, wavefronts)
-
-    def _intermediates(
-        self, normalize: str, opd: Value | None, parameters: Mapping[str, Value], only_last: bool
-    ) -> list[Any]:
-        """Fields at the planes as `poppy.Wavefront`; other systems refuse the keywords."""
-        raise NotImplementedError
 
     def describe(self) -> str:
         """A table of all planes, one per line, for ``print``; poppy's `describe` prints itself."""

@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from astropy import units as u
 from astropy.io import fits
 
 from pyklip_diffrender.errors import DiffrenderError
@@ -23,6 +22,7 @@ from pyklip_diffrender.scene.pixel_checks import (
     why_no_star,
     why_odd_unit,
 )
+from pyklip_diffrender.wavefront.opd_map import length_unit
 from pyklip_diffrender.wavefront.wss import EXTENSION
 
 _MAP = "it is an OPD map, no frame of a star; OPD maps are given as opd"
@@ -144,5 +144,4 @@ def _is_map(hdu: Any) -> bool:
     """Whether an HDU has a map of path differences, as wavefront sensing writes them."""
     if hdu.name == EXTENSION:
         return True
-    unit = u.Unit(str(hdu.header.get("BUNIT", "")), parse_strict="silent")
-    return bool(hdu.is_image and unit.is_equivalent(u.m))
+    return hdu.is_image and length_unit(str(hdu.header.get("BUNIT", ""))) is not None
