@@ -289,9 +289,8 @@ class SkyModel:
         ny, nx = first.observation.shape
         rows, columns = (np.arange(0, n, _THROUGHPUT_STEP_PIXELS) for n in (ny, nx))
         y, x = (each.ravel() for each in np.meshgrid(rows, columns, indexing="ij"))
-        comb = (
-            y // _THROUGHPUT_STEP_PIXELS % _COMB_STEP
-        ) * _COMB_STEP + x // _THROUGHPUT_STEP_PIXELS % _COMB_STEP
+        row, column = (each // _THROUGHPUT_STEP_PIXELS % _COMB_STEP for each in (y, x))
+        comb = row * _COMB_STEP + column
         signs = np.random.default_rng(seed).choice([-1.0, 1.0], len(y))
         kept = np.full(len(y), np.nan)
         angle = first.observation.position_angle

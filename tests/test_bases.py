@@ -72,8 +72,7 @@ def test_a_tip_rises_along_x_and_a_tilt_along_y(k):
 
 def test_segments_are_where_the_telescope_has_them():
     """A1 is at the top (+V3)."""
-    assert [name[:2] for name in SEGMENTS.names[:3]] == ["A1"] * 3
-    assert [name.split()[-1] for name in SEGMENTS.names[:3]] == ["piston", "tip", "tilt"]
+    assert next(iter(jwst_segments())).startswith("A1")
     piston = SEGMENTS.modes(GRID, 0, 1)[0]
     y = float((piston * GRID.y[:, None]).sum() / piston.sum())
     x = float((piston * GRID.x).sum() / piston.sum())

@@ -71,6 +71,7 @@ def test_wavefront_response_is_the_slope_of_the_fine_model(changes, npix, tolera
     model = system(**changes)
     opd = downsample(OPD, model.npix)
     response = WavefrontResponse(model, BASIS, opd, VALUES, npix=npix)
+    response.store()
     assert response.coarse.npix == npix
     image = response.image(model.fields(opd, **VALUES), VALUES)
     assert image.shape == (len(BASIS), 20, 24)
@@ -86,6 +87,7 @@ def test_wavefront_response_takes_the_field_of_the_star_it_is_asked_about():
     coefficients[[0, 20, 60, 61]] = torch.tensor([20.0, -20.0, 8.0, 8.0], dtype=torch.float64)
     moved = OPD + BASIS.opd(coefficients, PupilGrid.full(NPIX)) * NANOMETRE
     response = WavefrontResponse(model, BASIS, OPD, VALUES, npix=NPIX)
+    response.store()
     there = response.image(model.fields(moved, **VALUES), VALUES)
     here = response.image(model.fields(OPD, **VALUES), VALUES)
     chosen = [29, 41, 57, 90, 110]
@@ -148,6 +150,8 @@ def test_derivatives_follow_changes_in_the_last_pupil(route):
               "detector_shift": torch.tensor([0.02, 0.01], dtype=torch.float64)}  # fmt: skip
     after = before | {name: before[name] + torch.as_tensor(move) for name, move in MOVES.items()}
     kept, anew = (WavefrontResponse(model, BASIS, start, at, npix=64) for at in (before, after))
+    kept.store()
+    anew.store()
     old, expected = [each.clone() for each in stored(kept)], stored(anew)
     last = LastPupil(kept.coarse)
     assert 0.05 < last.change(before, after) < 1
@@ -199,6 +203,8 @@ def test_derivatives_behind_a_bar_are_as_exact_as_behind_a_round_mask():
     model = nircam_coronagraph("F210M", image_mask="MASKSWB", npix=256, fov_pixels=32, nlambda=1)
     opd = torch.from_numpy(random_opd(3, npix=256, rms=60e-9).data)
     coarse, exact = (WavefrontResponse(model, FourierModes(4), opd, {}, npix=n) for n in (128, 256))
+    coarse.store()
+    exact.store()
     assert exact.coarse is model
     assert coarse.coarse.recipe["bar_reach"] == pytest.approx(2.5, abs=0.01)
     fields = model.fields(opd)

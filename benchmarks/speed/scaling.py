@@ -62,8 +62,9 @@ def scaling(setting: Setting) -> list[Case]:
     return cases
 
 
-def _response(setting: Setting, basis: Basis) -> Callable[[], WavefrontResponse]:
-    return partial(WavefrontResponse, setting.model, basis, setting.opd, {}, npix=setting.coarse[0])
+def _response(setting: Setting, basis: Basis) -> Callable[[], None]:
+    model, opd, npix = setting.model, setting.opd, setting.coarse[0]
+    return lambda: WavefrontResponse(model, basis, opd, {}, npix=npix).store()
 
 
 def _frames(setting: Setting, count: int) -> Callable[[], Any]:

@@ -579,9 +579,8 @@ def planet_spectra(
             for temperature in TEMPERATURES:
                 name = f"black body of {temperature} K"
                 flux = native_float64(BlackBody(temperature * u.K)(frequency).value)
-                rows.append(
-                    (name, [mean_in_filter(_SAMPLES_M, flux, each, name) for each in filters])
-                )
+                means = [mean_in_filter(_SAMPLES_M, flux, each, name) for each in filters]
+                rows.append((name, means))
         else:
             found, lost = _spectra_in_file(Path(request), filters)
             rows += found
@@ -604,9 +603,8 @@ def _spectra_in_file(
             if units and not _is(each.unit, (*_DENSITIES, *_BRIGHTNESSES)):
                 raise _unclear(path, [each], "flux densities")
             grid, flux = _samples(path, axis, each)
-            rows.append(
-                (each.name, [mean_in_filter(grid, flux, name, each.name) for name in filters])
-            )
+            means = [mean_in_filter(grid, flux, name, each.name) for name in filters]
+            rows.append((each.name, means))
         except (CorruptFileError, IncompatibleSetupError) as error:
             left_out.append((each.name, str(error)))
     if not rows:

@@ -168,9 +168,12 @@ class Noise:
         if not self.shares_pattern:
             return {k: self.weight[k].to(x.dtype) * x for k, x in images.items()}
         images = {k: x.double() for k, x in images.items()}
-        summed = self.summed(images)
+        return self._less_pattern(images, self.summed(images))
+
+    def _less_pattern(self, images: Mapping[int, Tensor], part: Tensor) -> dict[int, Tensor]:
+        """Images less c times a part, (..., ny, nx), whitened, for all frames."""
         return {
-            k: weight * (images.get(k, torch.zeros(())) - common * summed)
+            k: weight * (images.get(k, torch.zeros(())) - common * part)
             for k, (weight, common) in enumerate(zip(self.weight, self.common, strict=True))
         }
 
@@ -190,10 +193,7 @@ class Noise:
             # (1 - a t t^T)^2 = 1 - t t^T = M^-1 with a = 1 / (1 + sqrt(1 - t^T t)).
             summed = self.summed({k: x.double() for k, x in images.items()})
             part = summed / (1 + torch.sqrt(1 - self._pattern_power))
-            white = {
-                k: weight * (images.get(k, torch.zeros(())) - common * part)
-                for k, (weight, common) in enumerate(zip(self.weight, self.common, strict=True))
-            }
+            white = self._less_pattern(images, part)
         return torch.cat([each.flatten(1) for each in white.values()], dim=1)
 
     def at_pixels(self, pixels: Tensor) -> Noise:

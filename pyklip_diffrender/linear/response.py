@@ -374,8 +374,7 @@ class WavefrontResponse:
     """Derivative of the complex field on the detector with respect to wavefront modes.
 
     A coarse copy of the model with `npix` pupil samples and at most so many `wavelengths` is
-    differentiated about `opd` (n, n), m. With `stored` the derivatives are computed at once;
-    otherwise in every call of `image` until `store` is called.
+    differentiated about `opd` (n, n), m, in every call of `image` until `store` is called.
     """
 
     def __init__(
@@ -387,7 +386,6 @@ class WavefrontResponse:
         *,
         npix: int = 128,
         wavelengths: int = 4,
-        stored: bool = True,
         progress: bool = False,
     ) -> None:
         self.model, self.basis = model, basis
@@ -406,8 +404,6 @@ class WavefrontResponse:
         self._batch = batch_of(samples, coarse.dtype.to_complex(), coarse.device)
         self._opd, self._values = downsample(opd, coarse.npix), values
         self._mode_fields: ModeFields | None = None
-        if stored:
-            self.store()
 
     @property
     def stored(self) -> bool:
@@ -574,7 +570,6 @@ class Reading:
             values,
             npix=cache.npix,
             wavelengths=cache.wavelengths,
-            stored=False,
             progress=cache.progress,
         )
         if not self._is_last and response.size <= cache.memory:

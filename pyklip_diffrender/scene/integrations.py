@@ -259,9 +259,8 @@ def _judge_pointing(
     median = _median(data, valid, group)
     rows, columns = np.indices(median.shape)
     x, y = frames["center"][group].mean(axis=0)
-    near = (
-        np.hypot((columns - x) * pixelscale[0], (rows - y) * pixelscale[1]) < _MASKED_PIXELS_ARCSEC
-    )
+    distance = np.hypot((columns - x) * pixelscale[0], (rows - y) * pixelscale[1])
+    near = distance < _MASKED_PIXELS_ARCSEC
     # A star that moves by d changes a pixel by its slope times d.
     slopes = np.hypot(*np.gradient(median))
     allowed = _JITTER_PIXELS * slopes + _INTEGRATION_FLUX_CHANGE * np.abs(median)

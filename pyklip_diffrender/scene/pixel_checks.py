@@ -266,11 +266,8 @@ def brightness(observation: Observation) -> float:
     x, y = center - np.round(center)
     rows, columns = np.indices(image.shape) - len(image) // 2
     distance = np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale))
-    return float(
-        (
-            image * np.clip((_CORE_ARCSEC + _EDGE_ARCSEC - distance) / (2 * _EDGE_ARCSEC), 0.0, 1.0)
-        ).sum()
-    )
+    weight = np.clip((_CORE_ARCSEC + _EDGE_ARCSEC - distance) / (2 * _EDGE_ARCSEC), 0.0, 1.0)
+    return float((image * weight).sum())
 
 
 def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
@@ -353,9 +350,8 @@ def _turn(pattern: Image, other: Image) -> str:
 
     likenesses = {name: likeness(undo(pattern)) for name, undo in _SYMMETRIES.items()}
     best = max(likenesses, key=lambda name: likenesses[name])
-    return (
-        best if likenesses[best] > max(_ALIKE_CORRELATION, likeness(pattern) + _TURNED_GAIN) else ""
-    )
+    least = max(_ALIKE_CORRELATION, likeness(pattern) + _TURNED_GAIN)
+    return best if likenesses[best] > least else ""
 
 
 def why_odd_unit(observation: Observation) -> str:

@@ -62,11 +62,9 @@ def stamp_about(
     distance = np.hypot(rows, columns) * pixelscale
     all_rows, all_columns = np.indices(data.shape)
     outside = valid & (np.hypot(all_columns - x, all_rows - y) * pixelscale > _SKY_ARCSEC)
-    sky = (
-        data[outside]
-        if outside.sum() > _SKY_PIXELS
-        else np.sort(data[valid])[: valid.sum() // 5 + 1]
-    )
+    sky = data[outside]
+    if len(sky) <= _SKY_PIXELS:
+        sky = np.sort(data[valid])[: valid.sum() // 5 + 1]
     # A nebula or a neighbour may be brighter elsewhere than about the star.
     ring = data[window][valid[window] & (distance > _RING_ARCSEC)]
     level = float(np.median(sky))
@@ -119,9 +117,8 @@ def center_of_pattern(image: Image, distance: Image) -> Image:
     """
     # Square roots, within 1.2 arcsec of the middle: a point source is then a small part of the
     # light, and the star's pattern, which fills the field, most of it.
-    return center_of_symmetry(
-        np.sqrt(np.maximum(np.where(distance < _PATTERN_ARCSEC, image, 0.0), 0.0))
-    )
+    near = np.where(distance < _PATTERN_ARCSEC, image, 0.0)
+    return center_of_symmetry(np.sqrt(np.maximum(near, 0.0)))
 
 
 def measured_offset(

@@ -51,13 +51,8 @@ class SegmentMotions:
 
     groups = ("segment",)
 
-    def __init__(self) -> None:
-        self.names = tuple(
-            f"{name} {motion}" for name in jwst_segments() for motion in ("piston", "tip", "tilt")
-        )
-
     def __len__(self) -> int:
-        return len(self.names)
+        return 3 * len(jwst_segments())
 
     @property
     def group_index(self) -> Tensor:
@@ -236,9 +231,10 @@ def coefficients_of(maps: Tensor, basis: Basis, grid: PupilGrid) -> Tensor:
     They have the unit of the maps, and are 0 for modes of segments where all maps are 0.
     """
     lit = (maps != 0).any(dim=0)
-    starts = range(0, len(basis), _MODES_AT_A_TIME)
-    stops = [min(start + _MODES_AT_A_TIME, len(basis)) for start in starts]
-    parts = [basis.modes(grid, *each)[:, lit] for each in zip(starts, stops, strict=True)]
+    parts = [
+        basis.modes(grid, start, min(start + _MODES_AT_A_TIME, len(basis)))[:, lit]
+        for start in range(0, len(basis), _MODES_AT_A_TIME)
+    ]
     inside = torch.cat(parts)
     system = inside @ inside.T
     diagonal = system.diagonal()
