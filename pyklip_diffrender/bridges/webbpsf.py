@@ -31,8 +31,12 @@ from pyklip_diffrender.optics.planes import (
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.optics.psf_hdus import poppy_psf, require_one_sampling
-from pyklip_diffrender.optics.system import InstrumentSystem, OpticalSystem
+from pyklip_diffrender.optics.system import (
+    InstrumentSystem,
+    OpticalSystem,
+    poppy_psf,
+    require_one_sampling,
+)
 from pyklip_diffrender.wavefront.opd_map import check_opd, opd_to_hdus
 
 Array = NDArray[np.float64]

@@ -141,7 +141,7 @@ def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> ND
 
 # Compare the integrations of a file, and leave out what deviates from the others.
 
-Stack = NDArray[np.float64]
+Image = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _PIXELS_AT_A_TIME = 2**18
@@ -201,7 +201,7 @@ def compressed(stack: NDArray[Any], kept: NDArray[np.bool_]) -> NDArray[Any]:
     return stack[: len(where)]
 
 
-def empty_integrations(data: Stack, valid: Iterable[Mask]) -> Judgement:
+def empty_integrations(data: Image, valid: Iterable[Mask]) -> Judgement:
     """Find integrations without `valid` pixels, or whose pixels all have one value.
 
     `data` is (frames, ny, nx), each of `valid` (ny, nx).
@@ -293,7 +293,7 @@ def _judge_pointing(
     return remarks
 
 
-def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
+def _median(data: Image, valid: Mask, group: NDArray[np.intp]) -> Image:
     """Median of the valid pixels of some frames, (ny, nx); 0 where there are none."""
     median = np.zeros(data.shape[1:])
     rows = max(1, _PIXELS_AT_A_TIME // (len(group) * data.shape[2]))
@@ -311,7 +311,7 @@ def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
     return median
 
 
-def _brightness(frame: Stack, median: Stack, sigma: Stack, usable: Mask) -> float:
+def _brightness(frame: Image, median: Image, sigma: Image, usable: Mask) -> float:
     """Ratio of the star's brightness in a frame and in the median; 1 if the star is not seen."""
     # sum of (frame - a median)^2 is minimal at a = sum of frame median / sum of median^2.
     bright = usable & (median > _STARLIT_PIXEL_SNR * sigma)
@@ -319,7 +319,7 @@ def _brightness(frame: Stack, median: Stack, sigma: Stack, usable: Mask) -> floa
     return float((frame[bright] * median[bright]).sum() / norm) if norm > 0 else 1.0
 
 
-def _deviating(difference: Stack, sigma: Stack, usable: Mask, allowed: Stack) -> Mask:
+def _deviating(difference: Image, sigma: Image, usable: Mask, allowed: Image) -> Mask:
     """Pixels that deviate by more than noise and jitter, singly or in squares."""
     weight = usable.astype(float)
     excess = np.maximum(np.abs(difference) - allowed, 0.0) * weight
@@ -340,7 +340,7 @@ def _deviating(difference: Stack, sigma: Stack, usable: Mask, allowed: Stack) ->
     return np.asarray(usable & (single | binary_dilation(smooth, reach)))
 
 
-def pointings(center: Stack, angles: NDArray[np.float64] | None) -> Iterator[NDArray[np.intp]]:
+def pointings(center: Image, angles: NDArray[np.float64] | None) -> Iterator[NDArray[np.intp]]:
     """Indices of frames that can be averaged, one array for each place and angle of the star.
 
     `center` is x, y of the star in pixels, (frames, 2); `angles` are in degrees, (frames,), or
@@ -366,8 +366,6 @@ def pointings(center: Stack, angles: NDArray[np.float64] | None) -> Iterator[NDA
 # on the frame itself, far from the star.
 
 _log = logging.getLogger(__name__)
-
-Image = NDArray[np.float64]
 
 _STARLIGHT_NOISE_ARCSEC = 6.0
 """arcsec from the star beyond which its light adds no noise. Closer in, a bright star's light still

@@ -422,13 +422,11 @@ class Observation:
 
     def continues_in(self, other: Observation) -> bool:
         """Whether the frames of another observation can be added to these, as one pointing."""
-        if (self.position_angles is None) != (other.position_angles is None):
-            return False
-        if (self.shape, self.unit, self.first_pixel) != (
-            other.shape, other.unit, other.first_pixel,
-        ):  # fmt: skip
-            return False
-        return len(self.followed_by([other]).pointings()) == 1
+        own, its = (
+            (each.shape, each.unit, each.first_pixel, each.position_angles is None)
+            for each in (self, other)
+        )
+        return own == its and len(self.followed_by([other]).pointings()) == 1
 
     def followed_by(self, others: Sequence[Observation]) -> Observation:
         """Add the frames of other observations of the exposure; see `continues_in`."""
