@@ -496,8 +496,6 @@ def _weighted_sum(changes: Sequence[Tensor], weights: Sequence[Tensor]) -> Tenso
     return total
 
 
-_Derivatives = TypeVar("_Derivatives")
-
 _FIELD_CHANGE_PER_STOP_DIAMETER = 20.0
 """Relative change of the field for a shift of the Lyot stop by one pupil diameter. The openings of
 the stop are about a twentieth of a diameter wide."""
@@ -527,6 +525,9 @@ class _About:
     now: dict[str, Tensor]  # Parameters to which the derivatives have followed.
 
 
+_Kept = TypeVar("_Kept", bound=tuple[_About, object])
+
+
 class Reading:
     """Access to the derivatives of a cache that records the largest error of what was taken.
 
@@ -542,6 +543,16 @@ class Reading:
         self._cache, self._allowed, self._keep, self._is_last = cache, allowed, keep, is_last
         self.farthest = 0.0
 
+    def _nearest(
+        self, kept: Sequence[_Kept], opd: Tensor, values: dict[str, Tensor], tilt: float
+    ) -> _Kept | None:
+        """The derivatives with the smallest error, if allowed; see `ResponseCache.error`."""
+        errors = [self._cache.error(about, opd, values, tilt) for about, _ in kept]
+        if not errors or min(errors) > self._allowed:
+            return None
+        self.farthest = max(self.farthest, min(errors))
+        return kept[errors.index(min(errors))]
+
     def near(self, opd: Tensor, values: dict[str, Tensor]) -> WavefrontResponse:
         """Take the response for nearly the same field, see `ResponseCache`.
 
@@ -549,12 +560,9 @@ class Reading:
         """
         cache = self._cache
         inside = opd[cache.model.entrance.lit]
-        near = cache.nearest(
-            cache.responses, inside, values, _RESPONSE_ERROR_PER_RADIAN, self._allowed
-        )
+        near = self._nearest(cache.responses, inside, values, _RESPONSE_ERROR_PER_RADIAN)
         if near is not None:
-            about, response, error = near
-            self.farthest = max(self.farthest, error)
+            about, response = near
             if cache.last_pupil.change(about.now, values) > _UNFOLLOWED_RADIANS:
                 response.follow(cache.last_pupil, values)
                 about.now = dict(values)
@@ -592,10 +600,9 @@ class Reading:
         """
         cache = self._cache
         inside = opd[cache.model.entrance.lit]
-        near = cache.nearest(cache.slopes, inside, values, _SLOPE_ERROR_PER_RADIAN, self._allowed)
+        near = self._nearest(cache.slopes, inside, values, _SLOPE_ERROR_PER_RADIAN)
         if near is not None:
-            about, slopes, error = near
-            self.farthest = max(self.farthest, error)
+            about, slopes = near
             if cache.last_pupil.change(about.now, values) > _UNFOLLOWED_RADIANS:
                 for slope in slopes.values():
                     cache.last_pupil.multiply(slope, about.now, values)
@@ -637,27 +644,13 @@ class ResponseCache:
         """The coarse model that is differentiated by parameters."""
         self.last_pupil = LastPupil(self.coarse)
 
-    def nearest(
-        self,
-        kept: Sequence[tuple[_About, _Derivatives]],
-        opd: Tensor,
-        values: dict[str, Tensor],
-        tilt: float,
-        allowed: float,
-    ) -> tuple[_About, _Derivatives, float] | None:
-        """The derivatives with the smallest error, and this error, if `allowed`; see `_error`."""
-        errors = [self._error(about, opd, values, tilt) for about, _ in kept]
-        if not errors or min(errors) > allowed:
-            return None
-        return *kept[errors.index(min(errors))], min(errors)
-
     def make_room(self, size: int) -> None:
         """Free the oldest responses until `size` bytes can be stored."""
         stored = [response for _, response in self.responses if response.stored]
         while stored and sum(each.size for each in stored) + size > self.memory:
             stored.pop(0).forget()
 
-    def _error(self, about: _About, opd: Tensor, values: dict[str, Tensor], tilt: float) -> float:
+    def error(self, about: _About, opd: Tensor, values: dict[str, Tensor], tilt: float) -> float:
         """Relative error of derivatives that have followed changes in the last pupil.
 
         `opd` is the OPD inside the pupil, m, and `tilt` the error per radian of tilt, rms over the

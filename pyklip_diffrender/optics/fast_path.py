@@ -454,9 +454,8 @@ class LatticeRoute:
 
     def _make_stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
         grid = onto[self._place]
-        ones = torch.ones(
-            grid.shape, dtype=self.detector.dtype.to_complex(), device=self.detector.device
-        )
+        kind = self.detector.dtype.to_complex()
+        ones = torch.ones(grid.shape, dtype=kind, device=self.detector.device)
         stop = Wavefront(ones, wavelength, grid)
         for plane, window in zip(
             self.planes[self._place + 1 :], onto[self._place + 1 :], strict=True

@@ -218,9 +218,12 @@ class Propagation:
             return self._lattice.field(wavefront, values, self.windows(values))
         return self.detector.field(self.behind_planes(wavefront, values), values)
 
-    def behind_planes(self, wavefront: Wavefront, values: Values) -> Wavefront:
-        """The wavefront behind the last plane, one plane after the other."""
-        for plane, onto in zip(self.between, self.windows(values), strict=True):
+    def behind_planes(
+        self, wavefront: Wavefront, values: Values, first: int = 0, last: int | None = None
+    ) -> Wavefront:
+        """The wavefront behind the last plane, or some of the planes, one after the other."""
+        windows = self.windows(values)
+        for plane, onto in zip(self.between[first:last], windows[first:last], strict=True):
             wavefront = plane.apply(wavefront, values, onto)
         return wavefront
 
@@ -253,19 +256,14 @@ class Propagation:
         This and `to_detector` make `propagate` in two steps, which are slower; the wavefront in
         between does not depend on `parameters_behind`.
         """
-        windows = self.windows(values)
         if self._lattice is not None:
-            return self._lattice.behind_occulter(wavefront, values, windows)
-        for plane, onto in zip(self.between[: self._last_occulter], windows, strict=False):
-            wavefront = plane.apply(wavefront, values, onto)
-        return wavefront
+            return self._lattice.behind_occulter(wavefront, values, self.windows(values))
+        return self.behind_planes(wavefront, values, last=self._last_occulter)
 
     def to_detector(self, wavefront: Wavefront, values: Values) -> Tensor:
         """Field on the detector's samples from the field in the pupil behind the last occulter."""
-        first = self._last_occulter
-        for plane, onto in zip(self.between[first:], self.windows(values)[first:], strict=True):
-            wavefront = plane.apply(wavefront, values, onto)
-        return self.detector.field(wavefront, values)
+        behind = self.behind_planes(wavefront, values, first=self._last_occulter)
+        return self.detector.field(behind, values)
 
     def transmission(self, opd: Value | None = None, **parameters: Value) -> float:
         """Fraction of the collected light of a source far from the occulter that is detected.
