@@ -26,10 +26,9 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.reduction import pages, summarise
-from pyklip_diffrender.reduction.extended_light import looks_extended
-from pyklip_diffrender.reduction.fit_status import advice
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.products import page, write_report
+from pyklip_diffrender.reduction.remarks import advice, looks_extended
 from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.product_headers import world_coordinates

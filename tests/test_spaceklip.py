@@ -22,7 +22,6 @@ from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import backend
 from pyklip_diffrender.refinement import FitSettings
-from pyklip_diffrender.spaceklip import database_files, run
 from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
@@ -118,7 +117,7 @@ def stub_product(folder, filter):
 
 def test_candidates_become_rows_of_spaceklips_table(tmp_path):
     made = fake_detection((-0.3, 0.4), 90.0)
-    table = database_files.source_table(made, tmp_path / "x.fits")
+    table = spaceklip.source_table(made, tmp_path / "x.fits")
     assert list(table["ID"]) == [1, 2]
     # +y points east, and +x north.
     np.testing.assert_allclose(table["RA"][1], 0.4, atol=1e-9)
@@ -137,17 +136,17 @@ def test_products_have_spaceklips_keywords_and_curves(tmp_path):
     product = tmp_path / "x-KLmodes-all.fits"
     header = fits.Header({"PSFCENTX": 20.0, "PSFCENTY": 19.5, "KLMODE0": 1})
     fits.writeto(product, np.zeros((1, SIDE, SIDE)), header)
-    database_files.complete_header(product, table, "ADI")
+    spaceklip.complete_header(product, table, "ADI")
     header = fits.getheader(product)
     assert (header["NINTS"], header["MODE"], header["ANNULI"]) == (2, "ADI", 1)
     assert (header["CRPIX1"], header["CRPIX2"], header["CRVAL1"]) == (21.0, 20.5, 201.0)
     assert (header["CD1_1"], header["CD2_2"]) == pytest.approx((-PIXEL / 3600, PIXEL / 3600))
     assert "BLURFWHM" not in header
-    database_files.write_contrast(product, fake_detection((0.1, 0.1), 0.0))
+    spaceklip.write_contrast(product, fake_detection((0.1, 0.1), 0.0))
     for name, values in (("seps", [0.3, 0.5]), ("cons", [1e-4, 1e-5]), ("maskcons", [1e-4, 1e-5])):
         saved = np.load(tmp_path / f"x-KLmodes-all_cal_{name}.npy")
         np.testing.assert_array_equal(saved, [values])
-    database_files.write_database(tmp_path / "x.dat", table)
+    spaceklip.write_database(tmp_path / "x.dat", table)
     again = Table.read(tmp_path / "x.dat", format="ascii")
     assert list(again["FITSFILE"]) == list(table["FITSFILE"])
     assert again["ALIGN_SHIFT"][0] == "[[0.0, 0.0]]"
@@ -165,9 +164,9 @@ def test_columns_that_hold_no_value_end_nothing_after_the_fit(tmp_path):
     table.remove_column("APERNAME")
     product = tmp_path / "x-KLmodes-all.fits"
     fits.writeto(product, np.zeros((1, SIDE, SIDE)), fits.Header({"PSFCENTX": 20, "PSFCENTY": 20}))
-    database_files.complete_header(product, table, "ADI")
-    database_files.write_database(tmp_path / "x.dat", table)
-    database_files.write_mask(tmp_path / "x_psfmask.fits", table)
+    spaceklip.complete_header(product, table, "ADI")
+    spaceklip.write_database(tmp_path / "x.dat", table)
+    spaceklip.write_mask(tmp_path / "x_psfmask.fits", table)
     header = fits.getheader(product)
     assert (header["CWAVEL"], header["TARGPROP"], header["NINTS"]) == ("N/A", "? Pic", 0)
     assert not {"TARG_RA", "DWAVEL", "EXPSTART", "APERNAME", "CRVAL2"} & set(header)
@@ -190,7 +189,7 @@ def test_a_failure_is_reported_after_the_others(tmp_path, monkeypatch, caplog):
             raise IncompatibleSetupError("no such filter")
         return stub_product(folder, "F444W"), fake_detection((-0.3, 0.4), 0.0)
 
-    monkeypatch.setattr(run, "_reduced", reduced)
+    monkeypatch.setattr(spaceklip, "_reduced", reduced)
     with (
         pytest.warns(DiffrenderWarning) as skipped,
         pytest.raises(ExceptionGroup, match="1 of 2 concatenations failed") as caught,
@@ -228,7 +227,7 @@ def test_concatenations_of_one_target_are_searched_together(tmp_path, monkeypatc
     def reduced(key, table, sequence, folder, *others):
         return stub_product(folder, key), made[key]
 
-    monkeypatch.setattr(run, "_reduced", reduced)
+    monkeypatch.setattr(spaceklip, "_reduced", reduced)
     database = StandIn(tmp_path, obs)
     with pytest.warns(DiffrenderWarning, match=r"HD 1: F300M .* is left out .*MODEL_MISMATCH"):
         detections = spaceklip.run_obs(database, opd=OPD)
@@ -257,7 +256,7 @@ def test_files_are_judged_before_any_is_fitted(tmp_path):
     table = concatenation([*rolls, str(confirmation), str(own), str(other)])
     table["TYPE"] = ["SCI"] * 3 + ["REF"] * 2
     with pytest.warns(DiffrenderWarning) as caught:
-        left, sequence = run._admitted(KEY, table)
+        left, sequence = spaceklip._admitted(KEY, table)
     assert list(left["FITSFILE"]) == [*rolls, str(other)]
     uses = {row["file"]: row["use"] for row in sequence.table}
     assert uses == {

@@ -30,7 +30,7 @@ from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.detection.whole_frame import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics.grid import resample
-from pyklip_diffrender.pyklip_backend.fitted_star import FittedPointing
+from pyklip_diffrender.pyklip_backend.subtract import FittedPointing
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.reduction.pictures import _stamps
 from pyklip_diffrender.reduction.pipeline import _Run, prepare

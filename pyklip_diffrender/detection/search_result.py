@@ -48,8 +48,7 @@ from pyklip_diffrender.detection.measurement import (
 )
 from pyklip_diffrender.detection.published_limits import published_limits
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.tables import add_columns
+from pyklip_diffrender.io.tables import add_columns, html_summary
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 

@@ -23,14 +23,17 @@ from pyklip_diffrender.drawing.figures import (
 )
 from pyklip_diffrender.drawing.images import (
     SNR_LINEAR,
+    Epoch,
+    Stamp,
     light_norm,
     opd_map,
     pupil_image,
     signed_image,
+    sky_track,
     snr_map,
+    stamp_panels,
     star_image,
 )
-from pyklip_diffrender.drawing.measurements import Epoch, Stamp, sky_track, stamp_panels
 
 __all__ = [
     "SNR_LINEAR",

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.dataset_frames import observation_from_dataset
-from pyklip_diffrender.pyklip_backend.fitted_star import Fit, Subtraction
 from pyklip_diffrender.pyklip_backend.registration import (
     backend,
     is_registered,
     register,
     unregister,
 )
-from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.subtract import Fit, Subtraction, subtract_by_refinement
 
 __all__ = [
     "DiffrenderSettings",

@@ -23,7 +23,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.headers import set_keyword
 from pyklip_diffrender.io.units import rotation_matrix
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.fitted_star import FittedPointing
+from pyklip_diffrender.pyklip_backend.subtract import FittedPointing
 
 if TYPE_CHECKING:
     from pyklip_diffrender.detection.error_factor import ErrorFactor

@@ -43,7 +43,6 @@ from pyklip_diffrender.pyklip_backend.dataset_frames import (
     library_files,
     require_frames,
 )
-from pyklip_diffrender.pyklip_backend.fitted_star import Subtraction
 from pyklip_diffrender.pyklip_backend.forward_model import (
     check_forward_model,
     is_planet,
@@ -61,7 +60,7 @@ from pyklip_diffrender.pyklip_backend.output_files import (
     write_throughput,
 )
 from pyklip_diffrender.pyklip_backend.source_frames import ATTRIBUTE, why_without_source
-from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 # Place and mask subtracted frames the way pyKLIP's `klip_parallelized` does.

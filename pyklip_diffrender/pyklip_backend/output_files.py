@@ -25,7 +25,7 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.headers import fits_text, set_keyword
 from pyklip_diffrender.pyklip_backend.dataset_frames import Frames
-from pyklip_diffrender.pyklip_backend.fitted_star import Subtraction
+from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 

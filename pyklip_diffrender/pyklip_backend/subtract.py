@@ -1,38 +1,242 @@
-"""Find the star in frames: the one step of a reduction that this package replaces."""
+"""The star in frames: how it is found, the one step of a reduction that this package replaces."""
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import warnings
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, cast
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.progress import heard_by
+from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.options import QUICK_SIDE, SIDE, ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.fitted_star import (
-    Fit,
-    FittedPointing,
-    Subtraction,
-    counted,
-)
 from pyklip_diffrender.pyklip_backend.source_frames import Pointing, pointings_of
+from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.sequence import ExposureSequence
-from pyklip_diffrender.scene.simulation import model_for
+from pyklip_diffrender.scene.simulation import field_of, model_for
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.detection import Detection
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import PatternRequest
-    from pyklip_diffrender.refinement import Refinement
+    from pyklip_diffrender.reduction.pipeline import ReductionResult
+    from pyklip_diffrender.refinement import FrameFit, Refinement
+
 
 _log = logging.getLogger(__name__)
+
+Image = NDArray[np.float64]
+
+# One pointing of a fit: the star, and other sources, on the pixels of its frames.
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPointing:
+    """The part of a fit that belongs to one pointing."""
+
+    result: Refinement
+    index: int  # place of the pointing among the frames of the fit
+    pointing: Pointing
+    window: Window  # the fitted square
+    # (2,), x, y in pixels by which the fitted frames were moved onto the pixels of the detector.
+    away: Image
+
+    def __repr__(self) -> str:
+        return f"<FittedPointing: {self.pointing!r}, {self.result!r}>"
+
+    @property
+    def frame(self) -> FrameFit:
+        """The star in the frames of the pointing."""
+        return self.result.frames[self.index]
+
+    @cached_property
+    def box(self) -> Window:
+        """Pixels that can be rendered: the valid ones in the field of the mask, or those fitted."""
+        # The fitted wavefront can be rendered on a larger detector if the model's field can be
+        # changed.
+        observation = self.pointing.observation
+        field = field_of(observation)
+        inside = np.isfinite(field.paste(np.zeros(field.shape), observation.shape))
+        box = Window.holding(observation.valid & inside)
+        adjustable = "fov_pixels" in self.result.model.adjustable
+        return box if box not in self.window and adjustable else self.window
+
+    def star(self) -> Image:
+        """The star over all pixels that can be rendered, (Ny, Nx) of the frame, NaN elsewhere."""
+        # A fit ends where further steps gain less than the noise. How much of a faint planet it has
+        # taken for star by then depends on where it stopped. So the last step of the linear model
+        # is added, which is a small part of the noise, and after which every fit has taken as much
+        # as the exact solution.
+        return self._fitted_star() + self._last_step()
+
+    def _fitted_star(self) -> Image:
+        """The star as the fit has left it."""
+        group, window, box = self.pointing.observation, self.window, self.box
+        if box is not window:
+            star = self._rendered(box, None)
+            if self.result.pattern is not None:
+                origin = self.frame.observation.first_pixel
+                if origin is not None:
+                    origin = (origin[0] - window.x, origin[1] - window.y)
+                moved = dataclasses.replace(
+                    group, center=group.center + self.away, first_pixel=origin
+                )
+                pixels = moved.within(box)
+                star = star * (1 + self.result.pattern.at(pixels)[0])
+            return self.paste(star + float(self.frame.values["background"][0]), box)
+        if Window.holding(group.valid) not in window:
+            _log.warning(
+                "%s: the model's field of view cannot be changed; pixels outside its %d x %d are "
+                "NaN", group.name, window.shape[1], window.shape[0],
+            )  # fmt: skip
+        return self.paste(np.asarray(self.frame.star), window)
+
+    def change_of_star(self, change: Tensor) -> Image:
+        """Change of the star, (ny, nx) of the fitted square, for `change` (unknowns,).
+
+        Changes of companions do not count.
+        """
+        linear = self.result.linear
+        star = torch.tensor([unknown.name != "companions" for unknown in linear.unknowns])
+        change = torch.where(star, change, 0.0)
+        return np.asarray(linear.frames[self.index].image(change[:, None])[0].numpy())
+
+    def change_in_frames(self, change: Tensor) -> Image:
+        """Change of the star in the frames, (Ny, Nx); only background outside the square."""
+        background = sum(
+            float(value)
+            for unknown, value in zip(self.result.linear.unknowns, change, strict=True)
+            if unknown.name == "background" and unknown.frame in (-1, self.index)
+        )
+        star = self.paste(self.change_of_star(change), self.window)
+        return np.where(np.isnan(star), background, star)
+
+    def _last_step(self) -> Image:
+        """Change of the star by the linear model's solution, (Ny, Nx)."""
+        # Takes a second to import.
+        from pyklip_diffrender.refinement import Status
+
+        # Before a fit has converged, its linear model may not be good for so long a step.
+        if self.result.status is Status.ITERATION_LIMIT:
+            return np.zeros(self.pointing.observation.shape)
+        return self.change_in_frames(self.result.linear.step)
+
+    def source(self, offset: Image, box: Window) -> Image:
+        """A source as bright as the star on the pixels of `box` as they were fitted, (ny, nx).
+
+        `offset` is x, y in pixels from the star's place in the header.
+        """
+        return self._rendered(box, self.position(offset))
+
+    def position(self, offset: Image) -> tuple[float, float]:
+        """Position on the model's axes, arcsec, of a place in pixels from the header's star."""
+        detector = self.frame.model.detector
+        place = self.frame.observation.center[0] + offset
+        x, y = (
+            float(axis[: detector.oversample].mean()) / ARCSEC + pixels * scale
+            for axis, pixels, scale in zip(
+                detector.axes(self.frame.optical_values), place, detector.pixelscale, strict=True
+            )
+        )
+        return x, y + detector.shear * x
+
+    def from_star(self, offset: Image) -> Image:
+        """x, y in arcsec from the fitted star, of a place in pixels from the header's star."""
+        star = self.frame.optical_values.get("star_offset", torch.zeros(2))
+        return np.subtract(self.position(offset), star.cpu().numpy())
+
+    @property
+    def resolution(self) -> float:
+        """lambda/D, arcsec."""
+        return self.frame.model.resolution
+
+    def _rendered(self, box: Window, source: tuple[float, float] | None) -> Image:
+        x, y = self.pointing.observation.center[0] + self.away - (box.x, box.y)
+        return self.frame.render(
+            fov_pixels=box.shape, center=(x, y), background=False, source=source
+        )
+
+    def mean_light(self, light: Image) -> Image:
+        """Average light in all frames, (n, Ny, Nx), as the fit averages the frames: (ny, nx)."""
+        group = self.pointing.observation
+        # sum_k w_k light_k / sum_k w_k with w = 1 / error^2, which is 0 for pixels that are not
+        # valid.
+        weight = np.where(group.valid, group.error, np.inf) ** -2.0
+        total = np.sum(weight * np.nan_to_num(light[self.pointing.frames]), axis=0)
+        return self.cut(total / np.maximum(weight.sum(axis=0), np.finfo(float).tiny))
+
+    def cut(self, image: Image) -> Image:
+        """Cut the fitted square out of a frame, as it was fitted: (ny, nx)."""
+        cut = self.window.cut(image[np.newaxis], 0.0)
+        if np.abs(self.away).max() > 0:
+            cut = shift_frames(cut, self.away[np.newaxis])
+        return np.asarray(cut[0])
+
+    def paste(self, image: Image, box: Window) -> Image:
+        """Move an image of a box back to where the frames have it: (Ny, Nx), NaN elsewhere."""
+        if np.abs(self.away).max() > 0:
+            image = shift_frames(image[np.newaxis], -self.away[np.newaxis])[0]
+        return box.paste(image, self.pointing.observation.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """One fit of the star, to some of the frames."""
+
+    frames: tuple[int, ...]  # their indices
+    status: str  # how the fit ended
+    chi2: float  # per fitted pixel
+    result: Any = None  # for `detect`; a `Refinement` by default
+
+
+@dataclass(frozen=True, eq=False)
+class Subtraction:
+    """The star in the frames of a dataset."""
+
+    # (n, ny, nx), star and uniform background to subtract, in the unit and on the pixels of the
+    # observation; NaN outside the model's field.
+    star: NDArray[np.float64]
+    # At least one; together they cover all frames.
+    fits: tuple[Fit, ...]
+    # Name of the pattern that was used.
+    pattern: str = "none"
+    # Number of frames of reference stars that were used.
+    references: int = 0
+    # The parts of the fits, one for each pointing; empty for other subtractors.
+    pointings: tuple[FittedPointing, ...] = ()
+    # Fit, search and extended light, as `reduce` has them; None for other subtractors.
+    reduction: ReductionResult | None = None
+    # Number of candidates whose light was kept out of the star.
+    kept: int = 0
+
+    def __repr__(self) -> str:
+        fits = "; ".join(f"{fit.status}, chi2/pixel {fit.chi2:.3g}" for fit in self.fits)
+        return (
+            f"<Subtraction: {counted(len(self.star), 'frame')}, {fits}, detector pattern "
+            f"{self.pattern}>"
+        )
+
+    @property
+    def worst(self) -> Fit:
+        """The fit with the largest chi2."""
+        return max(self.fits, key=lambda fit: fit.chi2)
+
+
+def counted(number: int, noun: str) -> str:
+    """Number and noun, such as "3 frames"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def subtract_by_refinement(
@@ -59,7 +263,7 @@ def subtract_by_refinement(
     model = model_of(observation, settings, science[0])
     # Takes a second to import, so only after the input has been checked.
     from pyklip_diffrender.reduction import prepare
-    from pyklip_diffrender.reduction.fit_status import warn_of_status
+    from pyklip_diffrender.reduction.remarks import warn_of_status
 
     sequence = ExposureSequence(observation.target, science, tuple(references))
     options = _options(settings, observation, references)
@@ -142,7 +346,7 @@ def _options(
     settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
 ) -> ReduceOptions:
     """Options of the reduction; settings that are None have the defaults of `reduce`."""
-    from pyklip_diffrender.reduction.fit_status import MAX_CHI2
+    from pyklip_diffrender.reduction.remarks import MAX_CHI2
 
     pattern = _requested_pattern(settings, observation, references)
     return ReduceOptions(**{"max_chi2": MAX_CHI2, **settings.given, "pattern": pattern})

@@ -33,8 +33,8 @@ from pyklip_diffrender.errors import (
     DiffrenderError,
     DiffrenderWarning,
 )
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import numbered_stages, stage
+from pyklip_diffrender.io.tables import html_summary
 from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.options import ReduceOptions
@@ -44,9 +44,8 @@ from pyklip_diffrender.pattern import (
     fit_with_pattern,
     is_known_beside,
 )
-from pyklip_diffrender.reduction.extended_light import looks_extended, on_extended_light
-from pyklip_diffrender.reduction.fit_status import require_plausible
 from pyklip_diffrender.reduction.pages import remark_on_map
+from pyklip_diffrender.reduction.remarks import looks_extended, on_extended_light, require_plausible
 from pyklip_diffrender.reduction.visit import (
     Contribution,
     Joined,

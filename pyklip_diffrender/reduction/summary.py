@@ -21,9 +21,9 @@ from pyklip_diffrender.io.tables import labelled, plain_rows
 from pyklip_diffrender.io.units import east_and_north
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
-from pyklip_diffrender.reduction.fit_status import advice
 from pyklip_diffrender.reduction.pages import sentence
 from pyklip_diffrender.reduction.pipeline import ReductionResult
+from pyklip_diffrender.reduction.remarks import advice
 from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.detector_pattern import caveat
 from pyklip_diffrender.scene.observation import Observation

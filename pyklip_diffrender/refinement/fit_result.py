@@ -24,7 +24,7 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
 from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.headers import fits_unit
-from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.io.tables import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.grid import doubled_samples, resample
