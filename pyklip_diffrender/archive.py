@@ -6,7 +6,6 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -25,32 +24,16 @@ _SIZE_NOT_STATED = -1
 """Size of a file for which the archive states none."""
 
 
-@dataclass(frozen=True)
-class _Mast:
-    """The part of astroquery that this module needs."""
-
-    observations: Any
-    failures: tuple[type[Exception], ...]  # raised where the archive does not answer
-    no_results: type[Warning]
-
-
-def _mast() -> _Mast:
+def _mast() -> Any:
+    """The observations of MAST in astroquery; ArchiveError where that is not installed."""
     try:
-        from astroquery import exceptions
         from astroquery.mast import Observations
-        from requests import RequestException
     except ImportError as error:
         raise ArchiveError(
             "files from the archive need astroquery, which is not installed: "
             "python -m pip install astroquery"
         ) from error
-    failures = (
-        RequestException,  # Astroquery lets these through.
-        ConnectionError,
-        exceptions.TimeoutError,
-        exceptions.RemoteServiceError,
-    )
-    return _Mast(Observations, failures, exceptions.NoResultsWarning)
+    return Observations
 
 
 def cache_folder() -> Path:
@@ -91,15 +74,15 @@ def list_calints(
     >>> import pyklip_diffrender as dr
     >>> print(dr.archive.list_calints(1184, "G-7-34", filter="F444W"))  # doctest: +SKIP
     """
-    mast = _mast()
+    observations = _mast()
     try:
         number = int(program)
     except ValueError as error:
         raise IncompatibleSetupError(
             f"program: got {program!r}, expected the number of a JWST programme, such as 1184"
         ) from error
-    with _asking(mast):
-        observed = mast.observations.query_criteria(
+    with _asking():
+        observed = observations.query_criteria(
             obs_collection="JWST",
             instrument_name="NIRCAM/CORON",
             # The archive has used both spellings.
@@ -109,8 +92,8 @@ def list_calints(
     if not len(observed):
         raise ArchiveError(f"MAST has no coronagraphic frames of NIRCam of programme {number}")
     chosen = _chosen(observed, target, filter)
-    with _asking(mast):
-        products = mast.observations.get_unique_product_list(chosen)
+    with _asking():
+        products = observations.get_unique_product_list(chosen)
     if len(products):
         products = products[[_is_calints(row, filter) for row in products]]
     if not len(products):
@@ -176,15 +159,14 @@ def fetch_calints(
     >>> files = dr.fetch_calints(1184, "G-7-34", filter="F444W")  # doctest: +SKIP
     >>> result = dr.reduce(files, "maps")  # doctest: +SKIP
     """
-    mast = _mast()
     listing = list_calints(program, target, filter=filter, folder=folder)
-    listing = _permitted(mast, listing)
+    listing = _permitted(listing)
     inside = _inside(folder, int(program))
     with ProgressBar("files from MAST", len(listing), shown=progress) as bar:
         for count, row in enumerate(listing):
             if not row["complete"]:
                 try:
-                    _download(mast, row, inside / row["file"])
+                    _download(row, inside / row["file"])
                 except ArchiveError as error:
                     raise ArchiveError(
                         f"{error}. {count} of {len(listing)} files are complete in {inside}; the "
@@ -194,12 +176,12 @@ def fetch_calints(
     return [inside / name for name in listing["file"]]
 
 
-def _download(mast: _Mast, row: Any, path: Path) -> None:
+def _download(row: Any, path: Path) -> None:
     """Fetch a file under another name, and give it its own once it is complete."""
     with replacing(path) as temporary:
         temporary.unlink()  # Some releases of astroquery would go on with what is there.
-        with _asking(mast):
-            status, message, _ = mast.observations.download_file(
+        with _asking():
+            status, message, _ = _mast().download_file(
                 row["uri"], local_path=str(temporary), cache=False, verbose=False
             )
         if status != "COMPLETE":
@@ -212,7 +194,7 @@ def _download(mast: _Mast, row: Any, path: Path) -> None:
             raise ArchiveError(f"{path.name}: {size} of {expected} bytes arrived")
 
 
-def _permitted(mast: _Mast, listing: QTable) -> QTable:
+def _permitted(listing: QTable) -> QTable:
     """The files that may be fetched."""
     public = np.asarray(listing["access"]) == "PUBLIC"
     needed = ~public & ~np.asarray(listing["complete"])
@@ -220,8 +202,8 @@ def _permitted(mast: _Mast, listing: QTable) -> QTable:
         return listing
     token = os.environ.get(_TOKEN)
     if token:
-        with _asking(mast):
-            mast.observations.login(token=token)
+        with _asking():
+            _mast().login(token=token)
         return listing
     names = ", ".join(listing["file"][needed])
     reason = f"proprietary, and there is no token of MAST in {_TOKEN}: {names}"
@@ -232,13 +214,17 @@ def _permitted(mast: _Mast, listing: QTable) -> QTable:
 
 
 @contextmanager
-def _asking(mast: _Mast) -> Iterator[None]:
+def _asking() -> Iterator[None]:
     """Turn what goes wrong between here and the archive into errors that say so."""
+    from astroquery.exceptions import NoResultsWarning, RemoteServiceError, TimeoutError
+    from requests import RequestException
+
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", mast.no_results)
+            warnings.simplefilter("ignore", NoResultsWarning)
             yield
-    except mast.failures as error:
+    # Astroquery lets exceptions of requests through.
+    except (RequestException, ConnectionError, TimeoutError, RemoteServiceError) as error:
         raise ArchiveError(
             f"MAST cannot be reached ({type(error).__name__}: {error}). Check the network, or "
             "download the files from https://mast.stsci.edu and pass them"

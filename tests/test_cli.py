@@ -144,7 +144,7 @@ def test_links_that_lead_nowhere_are_refused_before_the_fit(tmp_path, place):
         path.symlink_to(target)
     with pytest.raises(errors.IncompatibleSetupError, match=r"--output: .* is a link to .*, which"):
         claim_folder(output, ("report.html",))
-    with pytest.raises(errors.IncompatibleSetupError, match=r"OUTPUT: .* is a link to "):
+    with pytest.raises(errors.IncompatibleSetupError, match=r"--output: .* is a link to "):
         claim_file(product if place == "product" else output)
 
 

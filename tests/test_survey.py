@@ -70,7 +70,7 @@ def command(tmp_path, monkeypatch):
     """Runs the command with other work than reductions, and returns its exit status."""
 
     def run(work, count, more=""):
-        monkeypatch.setattr("pyklip_diffrender.surveys.execution.reduce_job", work)
+        monkeypatch.setattr("pyklip_diffrender.surveys.driver.reduce_job", work)
         path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data", count))
         path.write_text(path.read_text() + more)
         return main(["survey", str(path), "-o", str(tmp_path / "out"), "-q"])

@@ -204,16 +204,28 @@ Examples:
 @option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler; default a local cluster.")
 @common
 @click.pass_obj
-def survey(run: Run, /, file: Path, output: Path, scheduler: str | None) -> int:
+def run_survey(run: Run, /, file: Path, output: Path, scheduler: str | None) -> int:
     """Reduce many sequences, with and without injected planets, as jobs.
 
     FILE is a TOML file with the sequences and their options. The same command goes on where an
     earlier one was stopped.
     """
     with importing():
-        from pyklip_diffrender.cli.reducing import run as run_survey
+        from pyklip_diffrender.surveys import survey
 
-    return run_survey(file, output, scheduler, progress=run.progress)
+    try:
+        table = survey(file, output, scheduler, progress=run.progress)
+    except KeyboardInterrupt:
+        click.echo(f"{PROGRAM}: interrupted; finished jobs are kept, and the same command goes on",
+                   err=True)  # fmt: skip
+        return 130
+    failed = table[table["status"] == "failed"]
+    finished = int((table["status"] == "finished").sum())
+    click.echo(f"{finished} of {len(table)} jobs finished, {len(failed)} failed")
+    for row in failed:
+        click.echo(f"  {row['name']} failed: {row['message']}")
+    click.echo(f"wrote {output / 'results.ecsv'} and {output / 'survey.html'}")
+    return 1 if len(failed) else 0
 
 
 def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Path | None) -> bool:
@@ -402,7 +414,7 @@ for _command in (
     demo,
     reduce_frames,
     learn,
-    survey,
+    run_survey,
     doctor,
 ):
     application.add_command(_command)

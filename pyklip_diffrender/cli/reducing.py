@@ -1,4 +1,4 @@
-"""The work of the commands `reduce` and `survey`."""
+"""The work of the command `reduce`."""
 
 from __future__ import annotations
 
@@ -38,13 +38,11 @@ from pyklip_diffrender.reduction import (
     write_comparison,
 )
 from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
+from pyklip_diffrender.reduction.products import read_summary
 from pyklip_diffrender.scene.sequence import SHORT, ExposureSequence, by_reason
-from pyklip_diffrender.surveys.driver import survey
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_opd
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
-
-# The work of the command `reduce`.
 
 _MAST = "mast"
 """Value of --opd for maps that come from MAST."""
@@ -165,7 +163,7 @@ def _reduced(preparation: Preparation, products: ProductFolder, *, progress: boo
         with stage("products"):
             files = products.keep(reduction)
     click.echo(f"wrote {products.folder / 'report.html'} and {len(files) - 1} more files")
-    summary = loads(read_text(products.folder / "summary.json"))
+    summary = read_summary(products.folder)
     status = summary["status"]
     click.echo(f"\n{summary['sentence']}\n{status['name']}: {status['message']}.")
     click.echo(status["advice"])
@@ -302,25 +300,3 @@ def _age(opd: OPDMap, sequence: ExposureSequence) -> str:
     if opd.date is None or sequence.date is None:
         return ""
     return f", sensed {opd.date.isot[:16]}, {opd.age(sequence.date)} the frames"
-
-
-# The command `pyklip-diffrender survey`.
-
-
-def run(config: Path, output: Path, scheduler: str | None = None, *, progress: bool = False) -> int:
-    """Run a survey, and return the exit status: 1 if some jobs failed, 130 if interrupted."""
-    try:
-        table = survey(config, output, scheduler, progress=progress)
-    except KeyboardInterrupt:
-        click.echo(
-            "pyklip-diffrender: interrupted; finished jobs are kept, and the same command goes on",
-            err=True,
-        )
-        return 130
-    failed = table[table["status"] == "failed"]
-    counts = {status: int((table["status"] == status).sum()) for status in ("finished", "failed")}
-    click.echo(f"{counts['finished']} of {len(table)} jobs finished, {counts['failed']} failed")
-    for row in failed:
-        click.echo(f"  {row['name']} failed: {row['message']}")
-    click.echo(f"wrote {output / 'results.ecsv'} and {output / 'survey.html'}")
-    return 1 if len(failed) else 0

@@ -130,7 +130,7 @@ class Run:
     progress: bool = False
     # Device of PyTorch.
     device: str = ReduceOptions.device
-    _handlers: list[logging.Handler] = field(default_factory=list)
+    _on_terminal: logging.Handler = field(default_factory=_OnTerminal)
 
     @contextmanager
     def messages(self) -> Iterator[None]:
@@ -150,25 +150,22 @@ class Run:
                 yield
         finally:
             package.setLevel(level)
-            for handler in self._handlers:
-                logging.getLogger().removeHandler(handler)
-                handler.close()
+            logging.getLogger().removeHandler(self._on_terminal)
+            self._on_terminal.close()
 
     def configure(self, *, verbose: bool, quiet: bool, device: str, threads: int | None) -> None:
         """Take what the options of all commands say."""
-        on_terminal = _OnTerminal()
         # Away from a terminal a bar is noise: the stages and a line a minute take its place.
         is_terminal = sys.stderr.isatty()
         self.progress = is_terminal and not quiet
         stages = not (quiet or is_terminal)
         threshold = logging.DEBUG if verbose else logging.WARNING
-        on_terminal.addFilter(
+        self._on_terminal.addFilter(
             lambda record: (
                 record.levelno >= threshold or (stages and record.name.endswith(".progress"))
             )
         )
-        logging.getLogger().addHandler(on_terminal)
-        self._handlers.append(on_terminal)
+        logging.getLogger().addHandler(self._on_terminal)
         logging.getLogger("pyklip_diffrender").setLevel(logging.DEBUG if verbose else logging.INFO)
         self.device = device
         if device != "cpu":
@@ -181,15 +178,16 @@ class Run:
 
 def claim_folder(folder: Path, products: tuple[str, ...]) -> None:
     """Raise IncompatibleSetupError if products cannot be written."""
-    _require_no_broken_link(folder, "--output")
-    for name in products:
-        _require_no_broken_link(folder / name, "--output")
-    _require_room(folder, _existing(folder))
+    for path in (folder, *(folder / name for name in products)):
+        _require_no_broken_link(path)
+    # The folder, or the nearest one above it that exists.
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    _require_room(folder, existing)
 
 
 def claim_file(path: Path) -> None:
     """Raise IncompatibleSetupError if a file cannot be written."""
-    _require_no_broken_link(path, "OUTPUT")
+    _require_no_broken_link(path)
     if not path.absolute().parent.is_dir():
         raise IncompatibleSetupError(f"--output: there is no folder {path.parent} to write into")
     if path.is_dir():
@@ -236,19 +234,14 @@ def require_in_place(*outputs: OutputFolder) -> None:
         raise ExistingFileError(moved_aside(asked, used))
 
 
-def _require_no_broken_link(path: Path, option: str) -> None:
+def _require_no_broken_link(path: Path) -> None:
     """Refuse a path with a link in it that leads nowhere, or in a circle."""
     for part in (*reversed(path.absolute().parents), path.absolute()):
         if part.is_symlink() and not os.path.exists(part):
             raise IncompatibleSetupError(
-                f"{option}: {part} is a link to {os.readlink(part)}, which does not exist or leads "
+                f"--output: {part} is a link to {os.readlink(part)}, which does not exist or leads "
                 "back to itself. Make what it points to, remove the link, or choose another place"
             )
-
-
-def _existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that exists."""
-    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
 
 def _require_device(name: str) -> None:
@@ -364,11 +357,6 @@ common = _all(
            help="Number of threads; default: PyTorch's choice."),
 )  # fmt: skip
 
-_OVERWRITE = option(
-    "--overwrite", is_flag=True, section="Output",
-    help="Replace products of an earlier run.",
-)  # fmt: skip
-
 
 def outputs(default: str | None = None, *, file: str | None = None) -> Decorator:
     """Where to write, a folder or the file that is described, and what to do if it is there."""
@@ -381,7 +369,10 @@ def outputs(default: str | None = None, *, file: str | None = None) -> Decorator
     output = option(
         "-o", "--output", type=file_type(), metavar=kind, section="Output", help=help_, **needed
     )
-    return _all(output, _OVERWRITE, common)
+    overwrite = option(
+        "--overwrite", is_flag=True, section="Output", help="Replace products of an earlier run."
+    )
+    return _all(output, overwrite, common)
 
 
 archive = _all(

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.surveys.config import Config, read_config
-from pyklip_diffrender.surveys.execution import Work, in_this_process, with_dask
+from pyklip_diffrender.surveys.execution import Work, in_this_process, reduce_job, with_dask
 from pyklip_diffrender.surveys.jobs import (
     Job,
     Record,
@@ -27,7 +27,7 @@ from pyklip_diffrender.surveys.jobs import (
     staged,
 )
 from pyklip_diffrender.surveys.stars import StarSearch, search_stars
-from pyklip_diffrender.surveys.survey_page import row, table_of
+from pyklip_diffrender.surveys.survey_page import page, row, table_of
 
 _log = logging.getLogger(__name__)
 
@@ -92,8 +92,6 @@ def survey(
     >>> import pyklip_diffrender as dr
     >>> table = dr.survey("survey.toml", "products")  # doctest: +SKIP
     """
-    from pyklip_diffrender.surveys.execution import reduce_job
-
     limit = read_config(config).memory_limit
     work: Work = reduce_job
     if limit is not None:
@@ -152,18 +150,9 @@ def run_survey(
 def _execute(
     missing: list[Job], jobs: Path, config: Config, scheduler: str | None, work: Work
 ) -> Iterator[tuple[Job, Record]]:
-    if not missing:
-        return iter(())
-    if scheduler is None and config.workers == 0:
+    if not missing or (scheduler is None and config.workers == 0):
         return in_this_process(missing, jobs, work)
-    return with_dask(
-        missing,
-        jobs,
-        work,
-        scheduler=scheduler,
-        workers=config.workers,
-        memory_limit=config.memory_limit,
-    )
+    return with_dask(missing, jobs, work, scheduler, config)
 
 
 class _Board:
@@ -215,8 +204,6 @@ class _Board:
 
     def write(self) -> None:
         """Write tables and page; raises IncompatibleSetupError if they cannot be written."""
-        from pyklip_diffrender.surveys.survey_page import page
-
         text = page(self.jobs, self.stars)
         # Written beside the old ones and then moved: whoever reads them meanwhile gets whole files.
         try:

@@ -31,6 +31,7 @@ from pyklip_diffrender.refinement import FrameFit, Refinement, nircam_settings
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import ExposureSequence
+from pyklip_diffrender.surveys.config import Config
 from pyklip_diffrender.surveys.jobs import (
     Injection,
     Job,
@@ -228,13 +229,7 @@ def in_this_process(todo: Sequence[Job], jobs: Path, work: Work) -> Iterator[tup
 
 
 def with_dask(
-    todo: Sequence[Job],
-    jobs: Path,
-    work: Work,
-    *,
-    scheduler: str | None = None,
-    workers: int | None = None,
-    memory_limit: float | None = None,
+    todo: Sequence[Job], jobs: Path, work: Work, scheduler: str | None, survey: Config
 ) -> Iterator[tuple[Job, Record]]:
     """Run jobs on a cluster, by default on this machine; yields each with its record.
 
@@ -263,10 +258,10 @@ def with_dask(
             }))  # fmt: skip
             try:
                 cluster = LocalCluster(
-                    n_workers=min(workers or CPU_COUNT, len(todo)),
+                    n_workers=min(survey.workers or CPU_COUNT, len(todo)),
                     threads_per_worker=1,
                     processes=True,
-                    memory_limit=memory_limit or "auto",
+                    memory_limit=survey.memory_limit or "auto",
                     # Any free port; None would ask for a certain one, and warn.
                     dashboard_address="127.0.0.1:0",
                     silence_logs=logging.CRITICAL,

@@ -24,6 +24,7 @@ from pyklip_diffrender.reduction import (
     search_together,
     write_comparison,
 )
+from pyklip_diffrender.reduction.products import read_summary
 from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staged
 
 FOLDER = "combined"
@@ -119,20 +120,18 @@ def _search(star: str, group: Group, output: Path, spectra: Sequence[str]) -> St
     final = output / FOLDER / folder_of(star, key)
     names = tuple(str(job) for job, _ in group)
     data = final / COMPARISON[1]
-    combined: Any = _combined_in(data)
+    combined = _combined_in(data)
     if combined is None:
         shutil.rmtree(final, ignore_errors=True)
         _write(star, group, final, spectra)
-        combined = json.loads(read_text(data))["combined"]
+        combined = _combined_in(data)
     return StarSearch(star, final.relative_to(output).as_posix(), names, combined)
 
 
-def _combined_in(data: Path) -> Mapping[str, Any] | None:
+def _combined_in(data: Path) -> Any:
     """Search in a ``comparison.json``; None if there is no such file, or a damaged one."""
     with suppress(OSError, ValueError, KeyError, TypeError):
-        combined: Mapping[str, Any] = json.loads(read_text(data))["combined"]
-        return combined
-    return None
+        return json.loads(read_text(data))["combined"]
 
 
 def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None:
@@ -145,7 +144,7 @@ def _write(star: str, group: Group, final: Path, spectra: Sequence[str]) -> None
     jobs = final.parent.parent / "jobs"
     summaries = {
         # Relative to the folder of the search.
-        f"../../jobs/{job.folder}": json.loads(read_text(jobs / job.folder / "summary.json"))
+        f"../../jobs/{job.folder}": read_summary(jobs / job.folder)
         for job, _ in group
     }
     try:
