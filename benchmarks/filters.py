@@ -23,7 +23,7 @@ from astropy.io import fits
 
 import pyklip_diffrender as dr
 from benchmarks.real_frames import DATA, opd_of
-from pyklip_diffrender.reduction import summarise
+from pyklip_diffrender.reduction.summary import summarise
 
 ROLLS = ("jw01184005001_03106", "jw01184006001_03106")
 FLUX = 0.3  # Jy

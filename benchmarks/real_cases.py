@@ -42,8 +42,8 @@ from benchmarks.provenance import provenance
 from benchmarks.real_frames import DATA, frames_of, opd_of
 from pyklip_diffrender.io.files import write_table
 from pyklip_diffrender.pattern import choice as patterns
-from pyklip_diffrender.reduction import summarise
 from pyklip_diffrender.reduction.klip import klip_curve, small_sample_factor
+from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.refinement import jansky_per_unit
 
 SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])

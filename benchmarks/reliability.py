@@ -249,7 +249,7 @@ def draw(results, path):
     """Draw the frequency with which hypotheses are true, by their probability."""
     stated = np.concatenate([each.stated for each in results])
     true = np.concatenate([each.true for each in results])
-    figure, ax = drawing.panel()
+    ax = drawing.panel()
     ax.plot([0, 1], [0, 1], "--", color=drawing.figures.INK, lw=1)
     for low, high in itertools.pairwise(EDGES):
         chosen = (stated >= low) & (stated <= high if high == 1 else stated < high)
@@ -260,7 +260,7 @@ def draw(results, path):
     ax.set_xlabel("stated probability")
     ax.set_ylabel("share that is true")
     ax.set_box_aspect(1.0)
-    drawing.save(figure, path)
+    drawing.save(ax.figure, path)
 
 
 if __name__ == "__main__":

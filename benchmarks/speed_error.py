@@ -49,7 +49,8 @@ from pyklip_diffrender.io.files import write_table
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.reduction import ReduceOptions, prepare
+from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.reduction.pipeline import prepare
 from pyklip_diffrender.refinement import FitSettings, Refinement, nircam_settings, refine
 from pyklip_diffrender.wavefront.bases import default_basis
 

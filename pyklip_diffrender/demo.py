@@ -49,9 +49,6 @@ DITHERS = (
 )  # fmt: skip
 """The 9-POINT-CIRCLE small-grid dither, mas."""
 
-_REFERENCE_SHIFT = 10
-"""Offset in x of the pattern's centre from the position of the target star, mas (appendix C)."""
-
 
 @dataclass
 class DemoResult:
@@ -82,7 +79,8 @@ def simulate_references(model: OpticalSystem, opd: Image, *, seed: int) -> Image
     scene = Scene(star=Star(w2_magnitude=ALPHA_PICTORIS_W2, exposure=400.0))
     frames = []
     for k, (x, y) in enumerate(DITHERS):
-        offset = ((x + _REFERENCE_SHIFT) * 1e-3, y * 1e-3)
+        # The centre of the dithers is 10 mas from the position of the target star (appendix C).
+        offset = ((x + 10) * 1e-3, y * 1e-3)
         frames.append(simulate(model, replace(scene, star_offset=offset), opd, seed=seed + k))
     return np.concatenate([frame.data for frame in frames])
 
@@ -91,7 +89,6 @@ def run_demo(
     *,
     contrast: float = 1e-6,
     separation: float = 0.6,
-    position_angle: float = 54.0,
     hours: float = 40.0,
     size: int = 80,
     seed: int = 1,
@@ -100,10 +97,10 @@ def run_demo(
 ) -> DemoResult:
     """Simulate, refine, subtract, and run KLIP on the same frame of `size` pixels a side.
 
-    The planet's place is in arcsec and degrees. The OPD map is `hours` old; `seed` determines
+    The planet is at a `separation` in arcsec. The OPD map is `hours` old; `seed` determines
     wavefront, drift and noise.
     """
-    planet = Planet(contrast, separation, position_angle)
+    planet = Planet(contrast, separation, 54.0)
     scene = Scene(planets=(planet,))
     model = nircam_coronagraph(
         "F444W",
@@ -220,9 +217,6 @@ _TITLES = {
     "detected": "Star refined, the planet found in the model",
 }
 
-_RESIDUAL_SCALE_SIGMAS = 6.0
-"""Limit of the scale for residuals, standard deviations."""
-
 
 def draw_demo(result: DemoResult) -> Any:
     """Draw the frame, four subtractions over the noise, the wavefront's change and the S/N map."""
@@ -243,7 +237,7 @@ def draw_demo(result: DemoResult) -> Any:
         )
         title = _TITLES[name].format(hours=result.table.meta["hours"])
         drawing.signed_image(
-            ax, result.images[name] / result.noise, grid, _RESIDUAL_SCALE_SIGMAS, places=planet,
+            ax, result.images[name] / result.noise, grid, 6.0, places=planet,
             bar="residual / noise", title=f"{title}\nSNR {facts['annulus SNR']:.1f}{kept}",
         )  # fmt: skip
     _draw_changes(axes[1, 1:3], result)

@@ -28,10 +28,11 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.headers import file_name, fits_text, known_number
+from pyklip_diffrender.options import SPECTRA
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.output_files import on_product
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
-from pyklip_diffrender.reduction import SPECTRA, by_star, in_words, search_together
+from pyklip_diffrender.reduction.several import by_star, in_words, search_together
 from pyklip_diffrender.refinement import to_jansky
 from pyklip_diffrender.scene.frame_file import FrameFile
 from pyklip_diffrender.scene.sequence import ExposureSequence
@@ -59,19 +60,17 @@ def source_table(detection: Detection, product: Path) -> Table:
         values = table[name] if name in table.colnames else unknown
         return np.asarray(getattr(values, "value", values))
 
+    def with_error(theirs: str, ours: str) -> dict[str, NDArray[Any]]:
+        return {theirs: column(ours), f"{theirs}_ERR": column(f"{ours}_error")}
+
     columns: dict[str, NDArray[Any]] = {
         "ID": np.arange(1, count + 1),
-        "RA": column("delta_ra"),
-        "RA_ERR": column("delta_ra_error"),
-        "DEC": column("delta_dec"),
-        "DEC_ERR": column("delta_dec_error"),
-        "FLUX_JY": column("flux_density"),
-        "FLUX_JY_ERR": column("flux_density_error"),
+        **with_error("RA", "delta_ra"),
+        **with_error("DEC", "delta_dec"),
+        **with_error("FLUX_JY", "flux_density"),
         **dict.fromkeys(_OTHER_FLUXES, unknown),
-        "CON": column("contrast"),
-        "CON_ERR": column("contrast_error"),
-        "DELMAG": column("delta_mag"),
-        "DELMAG_ERR": column("delta_mag_error"),
+        **with_error("CON", "contrast"),
+        **with_error("DELMAG", "delta_mag"),
         **dict.fromkeys(_MAGNITUDES, unknown),
         "SNR": column("snr"),
         "LN(Z/Z0)": unknown,

@@ -20,10 +20,10 @@ import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
 from pyklip_diffrender import cli, spaceklip
 from pyklip_diffrender.detection import Detection
-from pyklip_diffrender.options import OPTIONS
+from pyklip_diffrender.options import OPTIONS, SPECTRA
 from pyklip_diffrender.pattern import MeasuredPattern, PatternLibrary, combine_patterns
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
-from pyklip_diffrender.reduction import SPECTRA, summarise
+from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.refinement.fit_file import text_of
 from pyklip_diffrender.refinement.settings import nircam_settings
 from pyklip_diffrender.scene.aligned_frames import mask_place

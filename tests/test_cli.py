@@ -25,7 +25,9 @@ from benchmarks.synthetic_searches import searched, write_searched
 from pyklip_diffrender import errors
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.cli.session import claim_file, claim_folder
-from pyklip_diffrender.reduction import Preparation, ProductFolder, ReduceOptions
+from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.reduction.pipeline import Preparation
+from pyklip_diffrender.reduction.products import ProductFolder
 from pyklip_diffrender.wavefront.opd import random_opd
 
 # The package has the command under the name of its module.

@@ -25,8 +25,7 @@ from small_world import (
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.options import OPTIONS
-from pyklip_diffrender.reduction import SPECTRA
+from pyklip_diffrender.options import OPTIONS, SPECTRA
 from pyklip_diffrender.refinement import fitting
 
 pytestmark = [

@@ -23,7 +23,7 @@ from pyklip_diffrender.detection.sky_map import Family, SkyStack
 from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.linear.model import LinearModel, Unknown
-from pyklip_diffrender.reduction import search_together
+from pyklip_diffrender.reduction.several import search_together
 
 MOTION = (0.3, -0.2)
 YEAR = 365.25

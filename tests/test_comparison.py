@@ -10,7 +10,7 @@ import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
 from benchmarks.synthetic_searches import searched
 from pyklip_diffrender.cli import main
-from pyklip_diffrender.reduction import combined_rows, in_words, write_comparison
+from pyklip_diffrender.reduction.several import combined_rows, in_words, write_comparison
 
 MOTION = (0.28, -0.36)
 """Of AU Mic, arcsec per year."""

@@ -22,7 +22,8 @@ from pyklip_diffrender.pattern import (
     package_library,
 )
 from pyklip_diffrender.pyklip_backend import subtract_by_refinement
-from pyklip_diffrender.reduction import ReduceOptions, prepare
+from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.reduction.pipeline import prepare
 from pyklip_diffrender.scene.detector_pattern import caveat
 
 SIZE = 32

@@ -11,7 +11,8 @@ from benchmarks.stpsf_data import wss_file
 from pyklip_diffrender import errors
 from pyklip_diffrender.io import sensing_date
 from pyklip_diffrender.optics.grid import resample
-from pyklip_diffrender.reduction import ReduceOptions, prepare
+from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.reduction.pipeline import prepare
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import ExposureSequence
 from pyklip_diffrender.wavefront import random_opd

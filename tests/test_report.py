@@ -25,10 +25,11 @@ import pyklip_diffrender as dr
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.reduction import pages, summarise
+from pyklip_diffrender.reduction import pages
 from pyklip_diffrender.reduction.pictures import Klip, Overview, ReportPictures, SkyImages
 from pyklip_diffrender.reduction.products import page, write_report
 from pyklip_diffrender.reduction.remarks import advice, looks_extended
+from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.reduction.visit import Contribution, Visit
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.product_headers import world_coordinates
@@ -431,7 +432,7 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
         assert (attributes["src"] or "").startswith("data:image/png;base64,")
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
     assert all((a.get("src") or "data:").startswith("data:") for _, a in page.tags)
-    picture = pages.Picture(drawing.panel()[0], "")
+    picture = pages.Picture(drawing.panel().figure, "")
     assert picture.uri.startswith("data:image/png;base64,iVBOR")
     # Links are to the files beside it.
     linked = {a["href"] for _, a in page.tags if "href" in a}

@@ -12,12 +12,9 @@ from astropy.nddata import CCDData
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import DiffrenderWarning, ExistingFileError, IncompatibleSetupError
 from pyklip_diffrender.io.files import OutputFolder
-from pyklip_diffrender.reduction import (
-    Preparation,
-    ProductFolder,
-    ReduceOptions,
-    pipeline,
-)
+from pyklip_diffrender.reduction import ReduceOptions, pipeline
+from pyklip_diffrender.reduction.pipeline import Preparation
+from pyklip_diffrender.reduction.products import ProductFolder
 from pyklip_diffrender.refinement import coarse_arguments, faintness
 from pyklip_diffrender.refinement.settings import quick_settings, settings_for
 
@@ -88,10 +85,12 @@ def content(folder):
 
 
 def test_without_overwrite_products_of_another_run_are_kept_as_well(tmp_path):
-    def files(folder):
-        return [folder / name for name in ("a.txt", "b.txt")]
+    names = ("a.txt", "b.txt")
 
-    def writing(text, names=("a.txt", "b.txt")):
+    def files(folder):
+        return [folder / name for name in names]
+
+    def writing(text, names=names):
         def write(folder):
             for name in names:
                 (folder / name).write_text(text)
@@ -99,7 +98,7 @@ def test_without_overwrite_products_of_another_run_are_kept_as_well(tmp_path):
 
         return write
 
-    runs = [OutputFolder(tmp_path / "out", files, overwrite=False) for _ in range(3)]
+    runs = [OutputFolder(tmp_path / "out", names, overwrite=False) for _ in range(3)]
     assert runs[0].replace(writing("first")) == files(tmp_path / "out")
     for number, run in enumerate(runs[1:], 2):
         with pytest.warns(DiffrenderWarning, match="somebody else has written"):
@@ -108,11 +107,11 @@ def test_without_overwrite_products_of_another_run_are_kept_as_well(tmp_path):
         assert run.replace(writing("again")) == files(tmp_path / "out" / f"out-{number}")
     assert {path.read_text() for path in files(tmp_path / "out")} == {"first"}
     with pytest.raises(IncompatibleSetupError, match=r"a\.txt is a file, expected a folder"):
-        OutputFolder(tmp_path / "out" / "a.txt", files, overwrite=True)
+        OutputFolder(tmp_path / "out" / "a.txt", names, overwrite=True)
     with pytest.raises(ExistingFileError, match=r"a\.txt, .*b\.txt exist"):
-        OutputFolder(tmp_path / "out", files, overwrite=False)
+        OutputFolder(tmp_path / "out", names, overwrite=False)
     # What the new products do not have is removed, but not where somebody has changed it.
-    last = OutputFolder(tmp_path / "out", files, overwrite=True)
+    last = OutputFolder(tmp_path / "out", names, overwrite=True)
     assert last.replace(writing("last", ["a.txt"])) == [tmp_path / "out" / "a.txt"]
     assert not (tmp_path / "out" / "b.txt").exists()
     # Products that cannot be written leave the earlier ones as they are.

@@ -14,7 +14,8 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import measured_planet
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.instrument.spectrum import filter_throughput
-from pyklip_diffrender.reduction import ReduceOptions, prepare
+from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.reduction.pipeline import prepare
 from pyklip_diffrender.refinement import jansky_per_unit, star_flux_error, with_star_flux
 from pyklip_diffrender.wavefront.opd import as_opd_map
 

@@ -21,11 +21,11 @@ from pyklip_diffrender.pattern import (
     measure_patterns,
     pattern_for_visit,
 )
-from pyklip_diffrender.reduction import ReduceOptions, Visit, pipeline
+from pyklip_diffrender.reduction import ReduceOptions, pipeline
 from pyklip_diffrender.reduction import visit as visits
 from pyklip_diffrender.reduction.klip import klip_curve
 from pyklip_diffrender.reduction.summary import summarise
-from pyklip_diffrender.reduction.visit import with_references
+from pyklip_diffrender.reduction.visit import Visit, with_references
 from pyklip_diffrender.refinement import FitSettings, align_frame, join_frames, refine
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.settings import exposure_sequences
@@ -361,8 +361,8 @@ def reduced(frames, **options):
     """The run of a reduction beside frames of reference stars, and its result."""
     options = ReduceOptions(settings=SETTINGS, size=SIZE, **options)
     sequence = dr.ExposureSequence("HD 1", science(), tuple(frames))
-    run = pipeline._Run(pipeline.prepare(sequence, OPD, options, model=model()), False)
-    return run, run.result()
+    run = pipeline.prepare(sequence, OPD, options, model=model())
+    return run, run.run()
 
 
 @pytest.mark.slow

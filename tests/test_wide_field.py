@@ -33,7 +33,7 @@ from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pyklip_backend.subtract import FittedPointing
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.reduction.pictures import _stamps
-from pyklip_diffrender.reduction.pipeline import _Run, prepare
+from pyklip_diffrender.reduction.pipeline import prepare
 from pyklip_diffrender.scene.observation import Window
 from pyklip_diffrender.scene.sequence import ExposureSequence
 from pyklip_diffrender.scene.simulation import field_of, images_of_stars, within_field
@@ -108,9 +108,7 @@ def crowded():
 
 def run_of(wholes, size, **settings):
     options = ReduceOptions(settings=dr.FitSettings(**settings))
-    return _Run(
-        prepare(ExposureSequence("HD 1", tuple(wholes)), OPD, options, model=model(size)), False
-    )
+    return prepare(ExposureSequence("HD 1", tuple(wholes)), OPD, options, model=model(size))
 
 
 @pytest.mark.parametrize(
@@ -130,7 +128,7 @@ def test_a_bright_source_beyond_the_fitted_pixels_is_known_before_the_fit(
     (known,) = run._beyond
     assert known.contrast == pytest.approx(contrast, rel=0.1)
     assert np.hypot(*np.subtract(known.offset, source.offset)) < 0.05
-    assert run.result().fit.companions[0, 0] == pytest.approx(contrast, rel=0.01)
+    assert run.run().fit.companions[0, 0] == pytest.approx(contrast, rel=0.01)
 
 
 def test_a_frame_in_which_the_image_of_the_pupil_samples_repeats_is_rendered_with_more():
@@ -286,7 +284,7 @@ def test_a_faint_source_at_the_edges_of_the_fitted_pixels_is_fitted_with_the_sta
     for planets in ((), (source,)):
         frames = frames_of(planets, 0.0, 8.0)
         run = run_of(frames, FITTED, cycles=8)
-        result = run.result()
+        result = run.run()
         assert len(result.detection.candidates) == len(planets)
     alone = replace(result.fit, companions=np.zeros((0, 3)))
     (edge,) = sources_at_edges(alone, frames)

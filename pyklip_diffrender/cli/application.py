@@ -26,7 +26,6 @@ from pyklip_diffrender.cli.session import (
     file_type,
     importing,
     keep_freed_memory,
-    named_files,
     open_streams,
     option,
     outputs,
@@ -77,7 +76,9 @@ def demo(
 
     Needs no data, half a minute and 2 GB of memory.
     """
-    products = named_files(output, _DEMO, overwrite)
+    from pyklip_diffrender.io.files import OutputFolder
+
+    products = OutputFolder(output, _DEMO, overwrite=overwrite)
     claim_folder(output, _DEMO)
     with importing():
         from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
@@ -303,12 +304,13 @@ def learn(
     others, which tells how much a pattern is worth for a star that it was not learned from. The
     same command goes on where an earlier one was stopped.
     """
+    from pyklip_diffrender.io.files import OutputFolder, without_fits_suffix
+
     require_frames(frames, program)
     claim_file(output)
-    products = named_files(output.parent, (output.name,), overwrite)
+    products = OutputFolder(output.parent, (output.name,), overwrite=overwrite)
     from pyklip_diffrender.archive import fetch_calints
     from pyklip_diffrender.cli.reducing import opd_of
-    from pyklip_diffrender.io.files import without_fits_suffix
     from pyklip_diffrender.pattern import learn_patterns
 
     files = list(frames)

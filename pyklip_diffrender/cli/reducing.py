@@ -5,40 +5,40 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from json import loads
 from pathlib import Path
 from typing import Any
 
 import click
 
-from pyklip_diffrender.cli.session import Run, claim_folder, named_files, require_in_place
+from pyklip_diffrender.cli.session import Run, claim_folder, require_in_place
 from pyklip_diffrender.detection import COMBINED, Combination, checked_motion
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.instrument.spectrum import star_flux_density
-from pyklip_diffrender.io.files import read_text
-from pyklip_diffrender.io.progress import numbered_stages, stage
-from pyklip_diffrender.options import Accuracy, ReduceOptions
+from pyklip_diffrender.io.files import OutputFolder, read_text
+from pyklip_diffrender.io.progress import counted, numbered_stages, stage
+from pyklip_diffrender.options import SPECTRA, Accuracy, ReduceOptions
 from pyklip_diffrender.pattern import (
     PatternLibrary,
     combine_libraries,
     known_pattern,
     package_library,
 )
-from pyklip_diffrender.reduction import (
-    COMPARISON,
-    PRODUCTS,
-    SPECTRA,
+from pyklip_diffrender.reduction.pipeline import (
     Preparation,
-    ProductFolder,
-    in_words,
+    frames_for_pattern,
+    frames_in_likelihood,
     prepare,
+)
+from pyklip_diffrender.reduction.products import PRODUCTS, ProductFolder, read_summary
+from pyklip_diffrender.reduction.several import (
+    COMPARISON,
+    in_words,
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.reduction.pipeline import frames_for_pattern, frames_in_likelihood
-from pyklip_diffrender.reduction.products import read_summary
 from pyklip_diffrender.scene.sequence import SHORT, ExposureSequence, by_reason
 from pyklip_diffrender.wavefront.opd import Rule, as_opd_map, choose_opd
 from pyklip_diffrender.wavefront.opd_map import OPDMap
@@ -46,46 +46,6 @@ from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
 _MAST = "mast"
 """Value of --opd for maps that come from MAST."""
-
-
-@dataclass(frozen=True)
-class _Start:
-    """Options and starting maps of a command's reductions."""
-
-    opd: str
-    opd_date: Rule | None
-    star_sed: str | None
-    options: ReduceOptions
-
-    @classmethod
-    def checked(
-        cls, *, device: Any, quick: bool, opd: str, opd_date: Rule | None, star_sed: str | None,
-        **options: Any,
-    ) -> _Start:  # fmt: skip
-        """The start that the options of a command describe; UsageError if they cannot be."""
-        if star_sed is not None and options["star_flux"] is not None:
-            raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
-        accuracy: Accuracy = "quick" if quick else ReduceOptions.accuracy
-        try:
-            checked = ReduceOptions(device=device, accuracy=accuracy, **options)
-        except DiffrenderError as error:
-            raise click.UsageError(str(error)) from error
-        return cls(opd, opd_date, star_sed, checked)
-
-    def prepared(self, sequence: ExposureSequence) -> Preparation:
-        """Show the frames of a sequence and its OPD map, and check that it can be reduced."""
-        _show(sequence)
-        map_ = opd_of(sequence, self.opd, self.opd_date)
-        click.echo(f"OPD map: {map_.name}{_age(map_, sequence)}")
-        return prepare(sequence, map_, self._options_for(sequence.filter))
-
-    def _options_for(self, name: str | None) -> ReduceOptions:
-        """Options with the star's flux density in a filter, if there is a spectrum of the star."""
-        if self.star_sed is None:
-            return self.options
-        flux = star_flux_density(self.star_sed, name or "unknown")
-        click.echo(f"star: {flux.value:.4g} Jy in {name}, by {Path(self.star_sed).name}")
-        return replace(self.options, star_flux=flux)
 
 
 def run_reduction(
@@ -99,22 +59,29 @@ def run_reduction(
     spectra: tuple[str, ...],
     proper_motion: tuple[str, str] | None,
     parallax: str | None,
-    **options: Any,
+    opd: str,
+    opd_date: Rule | None,
+    star_sed: str | None,
+    quick: bool,
+    **keywords: Any,
 ) -> None:
     """Reduce the epochs and filters of a target, write all products and say what they show.
 
     A dry run makes all the checks of a run, and stops before the first fit.
     """
+    if star_sed is not None and keywords["star_flux"] is not None:
+        raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
+    accuracy: Accuracy = "quick" if quick else ReduceOptions.accuracy
     try:
         checked_motion(proper_motion, parallax)
+        options = ReduceOptions(device=run.device, accuracy=accuracy, **keywords)
     except DiffrenderError as error:
         raise click.UsageError(str(error)) from error
-    start = _Start.checked(device=run.device, **options)
     # What is there now may be replaced if the user says so, but not what other runs write later.
     writing = {"derivatives": derivatives, "overwrite": overwrite}
     whole = ProductFolder(output, **writing)
     claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED))
-    above = named_files(output, (*COMPARISON, *COMBINED), overwrite)
+    above = OutputFolder(output, (*COMPARISON, *COMBINED), overwrite=overwrite)
     earlier = [ProductFolder(each, overwrite=True) for each in _listed(output)]
     sequences = read()
     if not sequences:
@@ -122,13 +89,21 @@ def run_reduction(
     several = len(sequences) > 1
     folders = [output / name for name in _names(sequences)] if several else [output]
     written = [ProductFolder(each, **writing) for each in folders] if several else [whole]
-    _require_flux_and_spectra(sequences, start.options, spectra)
+    _require_flux_and_spectra(sequences, options, spectra)
     prepared = []
     for sequence, folder in zip(sequences, folders, strict=True):
         if several:
             claim_folder(folder, tuple(PRODUCTS))
             click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
-        prepared.append(start.prepared(sequence))
+        _show(sequence)
+        start = opd_of(sequence, opd, opd_date)
+        click.echo(f"OPD map: {start.name}{_age(start, sequence)}")
+        own = options
+        if star_sed is not None:
+            flux = star_flux_density(star_sed, sequence.filter or "unknown")
+            click.echo(f"star: {flux.value:.4g} Jy in {sequence.filter}, by {Path(star_sed).name}")
+            own = replace(options, star_flux=flux)
+        prepared.append(prepare(sequence, start, own))
         if dry_run:
             click.echo(describe_steps(prepared[-1].sequence, prepared[-1].options))
     if dry_run:
@@ -141,7 +116,7 @@ def run_reduction(
     above.clear()
     _clear([whole, *earlier], folders)
     if several:
-        search = {"spectra": spectra or SPECTRA, "star": start.star_sed}
+        search = {"spectra": spectra or SPECTRA, "star": star_sed}
         motion = {"motion": proper_motion, "parallax": parallax}
         _compared(summaries, place, **search, **motion)
     require_in_place(*written, above)
@@ -217,7 +192,7 @@ def describe_steps(sequence: ExposureSequence, options: ReduceOptions) -> str:
         steps.append("completeness")
     used = [*teaching, *joining]
     unused = sum(not any(each is one for one in used) for each in sequence.references)
-    only = f", with {unused} reference frame{'' if unused == 1 else 's'} for KLIP only"
+    only = f", with {counted(unused, 'reference frame')} for KLIP only"
     steps.append(f"products{only if unused else ''}")
     return "\n".join(f"{number}. {step}" for number, step in enumerate(steps, 1))
 

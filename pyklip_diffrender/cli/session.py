@@ -212,15 +212,6 @@ def _require_room(output: Path, folder: Path) -> None:
         )
 
 
-def named_files(folder: Path, names: tuple[str, ...], overwrite: bool) -> OutputFolder:
-    """Folder for products of these names; raises ExistingFileError as an `OutputFolder`."""
-    from pyklip_diffrender.io.files import OutputFolder
-
-    return OutputFolder(
-        folder, lambda inside: [inside / name for name in names], overwrite=overwrite
-    )
-
-
 def require_in_place(*outputs: OutputFolder) -> None:
     """Raise ExistingFileError, at the end of a run, if products are not where they should be."""
     from pyklip_diffrender.io.files import moved_aside

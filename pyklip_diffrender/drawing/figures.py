@@ -25,9 +25,6 @@ INK = "#1b1f24"
 ACCENT = "#0b6e4f"
 """A dark green, distinct from both ends of the red and blue maps."""
 
-_LABELLED = 4
-"""Largest number of circles with labels of more than two characters."""
-
 
 def halo() -> list[Any]:
     """Effects that make dark lines and text legible on any image."""
@@ -62,7 +59,7 @@ def circles(ax: Axes, places: ArrayLike, labels: Sequence[str] = ()) -> None:
         x, y, "o", mfc="none", mec=INK, ms=15, mew=1.6, label="companions", path_effects=halo()
     )  # fmt: skip
     is_short = all(len(label) <= 2 for label in labels)
-    shown = labels if is_short or len(x) <= _LABELLED else ()
+    shown = labels if is_short or len(x) <= 4 else ()
     for label, place in zip(shown, zip(x, y, strict=True), strict=False):
         ax.annotate(
             label, place, (0, 11), textcoords="offset points", color=INK, ha="center", va="bottom",
@@ -77,15 +74,6 @@ def unit_label(unit: UnitBase) -> str:
 
 
 # Figures, their axes, and writing them.
-
-_PANEL_INCHES = (4.6, 3.7)
-"""Size of a panel, inches: its letters are as large as a page's where it is as wide as a phone."""
-
-_WIDE_PANEL_INCHES = (6.8, 5.2)
-"""Size of a wide panel, inches."""
-
-_PANEL_AXES = (0.17, 0.13, 0.6, 0.77)
-"""Axes in a panel, the same for all, so that panels side by side are aligned."""
 
 
 def axes_for(ax: Any, count: int) -> Sequence[Axes]:
@@ -108,32 +96,31 @@ def axes_for(ax: Any, count: int) -> Sequence[Axes]:
 
 def new_figure(rows: int, columns: int) -> tuple[Figure, NDArray[Any]]:
     """Make a figure for a file, with a grid of axes, (rows, columns)."""
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-    size = (4.6 * columns, 4.0 * rows)
     # Colour bars and their labels are outside the axes that the layout knows.
-    figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(compress=True, w_pad=0.15))
+    figure = constrained((4.6 * columns, 4.0 * rows), compress=True, w_pad=0.15)
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def panel() -> tuple[Figure, Axes]:
-    """Make a figure with one axes, which a page can put beside others of its kind."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=_PANEL_INCHES)
-    return figure, figure.add_axes(_PANEL_AXES)
-
-
-def wide_panel() -> tuple[Figure, Axes]:
-    """Make a figure with one axes for a curve, which has a page to itself, and its legend."""
+def constrained(inches: tuple[float, float], **layout: Any) -> Figure:
+    """Make a figure whose layout leaves room for all labels."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(
-        figsize=_WIDE_PANEL_INCHES, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12)
-    )
-    return figure, figure.subplots()
+    return Figure(figsize=inches, layout=ConstrainedLayoutEngine(**layout))
+
+
+def panel() -> Axes:
+    """Make the axes of a figure that a page can put beside others of its kind."""
+    from matplotlib.figure import Figure
+
+    # Letters are as large as a page's where it is as wide as a phone. All have the same axes, so
+    # that they are aligned.
+    return Figure(figsize=(4.6, 3.7)).add_axes((0.17, 0.13, 0.6, 0.77))
+
+
+def wide_panel() -> Axes:
+    """Make the axes of a figure for a curve, which has a page to itself, and its legend."""
+    return constrained((6.8, 5.2), w_pad=0.12, h_pad=0.12).subplots()
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
@@ -142,8 +129,8 @@ def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
         figure.savefig(temporary, dpi=dpi, facecolor="white", format=Path(path).suffix[1:])
 
 
-def to_png(figure: Figure, dpi: int = 150) -> bytes:
+def to_png(figure: Figure) -> bytes:
     """Return the file that `save` would write."""
     stream = BytesIO()
-    figure.savefig(stream, format="png", dpi=dpi, facecolor="white")
+    figure.savefig(stream, format="png", dpi=150, facecolor="white")
     return stream.getvalue()

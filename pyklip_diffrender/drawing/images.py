@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pyklip_diffrender.drawing.figures import ACCENT, INK, circles, halo, label_sky, on_sky
+from pyklip_diffrender.drawing.figures import (
+    ACCENT,
+    INK,
+    circles,
+    constrained,
+    halo,
+    label_sky,
+    on_sky,
+)
 from pyklip_diffrender.io.units import east_and_north
 
 if TYPE_CHECKING:
@@ -31,9 +39,6 @@ _SIGNED = "RdBu_r"
 
 SNR_LINEAR = 5.0
 """Linear part of the scale for S/N."""
-
-_DECADES = 6
-"""Decades of a logarithmic scale."""
 
 
 def star_image(
@@ -123,7 +128,7 @@ def light_norm(image: Image, noise: Image | None = None) -> Any:
 
     low, high = float(np.nanmin(image)), float(np.nanmax(image))
     if noise is None:
-        return LogNorm(high * 10.0**-_DECADES, high, clip=True)
+        return LogNorm(1e-6 * high, high, clip=True)
     width = 3 * float(np.nanmedian(noise))
     return AsinhNorm(width, vmin=max(low, -width), vmax=max(high, low + width))
 
@@ -200,10 +205,7 @@ class Stamp:
 
 def stamp_panels(stamp: Stamp, unit: str) -> Figure:
     """Draw data, star-subtracted data, model and residual of a source in one frame."""
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-    figure = Figure(figsize=(4.8, 3.9), layout=ConstrainedLayoutEngine(compress=True, w_pad=0.08))
+    figure = constrained((4.8, 3.9), compress=True, w_pad=0.08)
     limit = max(float(np.nanmax(np.abs(stamp.model))), 3 * float(np.nanmedian(stamp.noise)))
     signed: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "bar": unit}
     light = {"cmap": "magma", "bar": unit}

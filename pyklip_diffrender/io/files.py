@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import io
+import json
 import os
 import re
 import secrets
@@ -31,13 +32,8 @@ from pyklip_diffrender.errors import (
     MissingFileError,
 )
 
-_GZIP = b"\x1f\x8b"
-
 _UNPACKED_IN_MEMORY_BYTES = 2**25
 """Bytes up to which a gzipped file is unpacked in memory, which is faster."""
-
-_CHUNK_BYTES = 2**22
-"""Bytes that are read at once."""
 
 _PACKED = re.compile(r"\.(gz|fz)$", re.IGNORECASE)
 """Suffixes of gzip and fpack."""
@@ -159,7 +155,7 @@ def _incomplete(path: Path, error: BaseException) -> CorruptFileError:
 def _unpacked(path: Path) -> Iterator[BinaryIO]:
     """The file, or what a gzipped file holds."""
     with path.open("rb") as file:
-        if file.read(2) != _GZIP:
+        if file.read(2) != b"\x1f\x8b":  # The magic number of gzip.
             file.seek(0)
             yield file
             return
@@ -169,7 +165,7 @@ def _unpacked(path: Path) -> Iterator[BinaryIO]:
             return
         file.seek(0)
         with gzip.GzipFile(fileobj=file) as stream:
-            while stream.read(_CHUNK_BYTES):
+            while stream.read(2**22):
                 pass
             stream.seek(0)
             yield stream  # type: ignore[misc]
@@ -251,8 +247,8 @@ class OutputFolder:
     Parameters
     ----------
     folder : path
-    products : callable
-        Returns the files in a folder that are called like products.
+    names : sequence of str
+        Names of the products.
     overwrite : bool
 
     Attributes
@@ -273,21 +269,24 @@ class OutputFolder:
     def __init__(
         self,
         folder: str | os.PathLike[str],
-        products: Callable[[Path], Iterable[Path]],
+        names: Iterable[str],
         *,
         overwrite: bool,
     ) -> None:
         self.asked = self.folder = Path(folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise IncompatibleSetupError(f"output: {folder} is a file, expected a folder")
-        self._products = products
-        require_new(products(self.folder), overwrite)
+        self._names = tuple(names)
+        require_new(self._products(), overwrite)
         # The products that may be replaced, as they are now.
-        self._known = stamps(products(self.folder))
+        self._known = stamps(self._products())
+
+    def _products(self) -> list[Path]:
+        return [self.folder / name for name in self._names]
 
     def place(self) -> Path:
         """Return the folder to write to now: a new one if somebody else has written to the old."""
-        found = stamps(self._products(self.folder))
+        found = stamps(self._products())
         if any(self._known.get(path) != stamp for path, stamp in found.items()):
             self.folder, self._known = _new_folder_in(self.asked), {}
         return self.folder
@@ -395,6 +394,16 @@ def write_fits(hdus: fits.HDUList, path: str | os.PathLike[str]) -> None:
         hdu.add_checksum(when="checksum of the extension")
     with replacing(path) as temporary:
         hdus.writeto(temporary, overwrite=True)
+
+
+def write_page(page: Path, html: str, data: Path, content: Mapping[str, Any]) -> None:
+    """Write a page of HTML and its content as JSON, each in one step."""
+    for path, text in (
+        (page, html),
+        (data, json.dumps(content, indent=2, allow_nan=False) + "\n"),
+    ):
+        with replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
 
 def sha256(path: str | os.PathLike[str]) -> str:

@@ -162,15 +162,19 @@ def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time |
     """Date (UTC) of the first of several cards that has one; CorruptFileError if it is no date."""
     for key in keys:
         text = header_text(header, key, name)
-        if text is None:
-            continue
-        try:
-            # With a format, because the guesses of astropy hold the errors of its trials, and with
-            # them all that the callers have in memory, until garbage is collected.
-            return Time(text.replace(" ", "T"), format="isot", scale="utc")
-        except ValueError as error:
-            raise card_error(name, key, text, "a date such as '2022-08-11T01:02:03'") from error
+        if text is not None:
+            return _date(text.replace(" ", "T"), key, name)
     return None
+
+
+def _date(text: str, cards: str, name: str) -> Time:
+    """Date (UTC) that the text of cards states."""
+    try:
+        # With a format, because the guesses of astropy hold the errors of its trials, and with
+        # them all that the callers have in memory, until garbage is collected.
+        return Time(text, format="isot", scale="utc")
+    except ValueError as error:
+        raise card_error(name, cards, text, "a date such as '2022-08-11T01:02:03'") from error
 
 
 def day_and_time(header: fits.Header, name: str) -> Time | None:
@@ -181,12 +185,7 @@ def day_and_time(header: fits.Header, name: str) -> Time | None:
     day, hour = (header_text(header, key, name) for key in ("DATE-OBS", "TIME-OBS"))
     if not (day and hour) or "T" in day:
         return None
-    try:
-        return Time(f"{day}T{hour}", format="isot", scale="utc")
-    except ValueError as error:
-        expected = "a date such as '2022-08-11T01:02:03'"
-        cards = "DATE-OBS with TIME-OBS"
-        raise card_error(name, cards, f"{day}T{hour}", expected) from error
+    return _date(f"{day}T{hour}", "DATE-OBS with TIME-OBS", name)
 
 
 def sensing_date(header: fits.Header, name: str) -> Time | None:

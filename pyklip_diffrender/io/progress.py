@@ -1,4 +1,4 @@
-"""Progress of long computations: one bar on a terminal, and few lines in the log."""
+"""Progress of long computations, on a terminal and in the log; numbers as words have them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from types import TracebackType
 from typing import Self
 
 from tqdm import tqdm
@@ -25,9 +24,6 @@ _LISTENER: ContextVar[Callable[[str], None] | None] = ContextVar("listener", def
 _BUSY: ContextVar[bool] = ContextVar("busy", default=False)
 """Whether a bar is shown already; bars inside it are not."""
 
-_LOG_INTERVAL_SECONDS = 60.0
-"""Shortest time between two lines of a bar in the log, s."""
-
 _COUNTED = "{desc}: {percentage:3.0f} % [{elapsed}<{remaining}]"
 _OPEN = "{desc}, step {n} [{elapsed}]"
 
@@ -37,6 +33,11 @@ def duration(seconds: float) -> str:
     if seconds < 100:
         return f"{max(seconds, 1):.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural where it needs one."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 @contextmanager
@@ -103,12 +104,7 @@ class ProgressBar:
         self._token = _BUSY.set(True)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._bar.close()
         _BUSY.reset(self._token)
 
@@ -118,7 +114,7 @@ class ProgressBar:
         text = ", ".join([self._name, *(f"{key} {value:.3g}" for key, value in values.items())])
         self._bar.set_description_str(text, refresh=False)
         self._bar.update(steps)
-        if not self._nested and time.monotonic() - self._logged >= _LOG_INTERVAL_SECONDS:
+        if not self._nested and time.monotonic() - self._logged >= 60:
             self._logged = time.monotonic()
             of = "" if self._total is None else f" of {self._total}"
             _log.info("%s, step %d%s", text, self._steps, of)

@@ -144,17 +144,6 @@ def _some(value: Any, has: Callable[[Any], bool]) -> bool:
     return any(_some(v, has) for v in value) if isinstance(value, list | tuple) else has(value)
 
 
-def _converted(
-    values: NDArray[np.float64], own: u.UnitBase, unit: u.UnitBase, name: str
-) -> NDArray[np.float64]:
-    try:
-        return np.asarray(own.to(unit, values))
-    except u.UnitConversionError as error:
-        raise UnitError(
-            f"{name}: got the unit '{own}', expected one that converts to '{unit}'"
-        ) from error
-
-
 _SPELLINGS = {
     "Angstrom": "a aa ang angstrom angstroms",
     "um": "um micron microns micrometer micrometers micrometre micrometres",
@@ -232,7 +221,14 @@ def to_unit(value: Any, unit: str | u.UnitBase, name: str) -> NDArray[np.float64
     dates, and uncertainties that are no standard deviations.
     """
     values, own = _without_unit(value, name)
-    return values if own is None else _converted(values, own, u.Unit(unit), name)
+    if own is None:
+        return values
+    try:
+        return np.asarray(own.to(unit, values))
+    except u.UnitConversionError as error:
+        raise UnitError(
+            f"{name}: got the unit '{own}', expected one that converts to '{u.Unit(unit)}'"
+        ) from error
 
 
 def to_number(value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any") -> float:
@@ -279,9 +275,7 @@ def to_pair(
     return x, y
 
 
-def require_bound(
-    number: float, name: str, bound: Bound, unit: str | u.UnitBase = u.dimensionless_unscaled
-) -> None:
+def require_bound(number: float, name: str, bound: Bound, unit: str | u.UnitBase) -> None:
     """Raise NonFiniteError, or IncompatibleSetupError for a finite number out of its bound."""
     if not np.isfinite(number):
         raise NonFiniteError(f"{name}: got {number}, expected a finite number")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.io.progress import heard_by
+from pyklip_diffrender.io.progress import counted, heard_by
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.options import QUICK_SIDE, SIDE, ReduceOptions
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
@@ -90,9 +89,7 @@ class FittedPointing:
                 origin = self.frame.observation.first_pixel
                 if origin is not None:
                     origin = (origin[0] - window.x, origin[1] - window.y)
-                moved = dataclasses.replace(
-                    group, center=group.center + self.away, first_pixel=origin
-                )
+                moved = replace(group, center=group.center + self.away, first_pixel=origin)
                 pixels = moved.within(box)
                 star = star * (1 + self.result.pattern.at(pixels)[0])
             return self.paste(star + float(self.frame.values["background"][0]), box)
@@ -234,11 +231,6 @@ class Subtraction:
         return max(self.fits, key=lambda fit: fit.chi2)
 
 
-def counted(number: int, noun: str) -> str:
-    """Number and noun, such as "3 frames"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
 def subtract_by_refinement(
     observation: Observation,
     opd: OPDMap,
@@ -262,7 +254,7 @@ def subtract_by_refinement(
     science = tuple(group.observation.combined() for group in groups)
     model = model_of(observation, settings, science[0])
     # Takes a second to import, so only after the input has been checked.
-    from pyklip_diffrender.reduction import prepare
+    from pyklip_diffrender.reduction.pipeline import prepare
     from pyklip_diffrender.reduction.remarks import warn_of_status
 
     sequence = ExposureSequence(observation.target, science, tuple(references))
@@ -277,7 +269,10 @@ def subtract_by_refinement(
     with heard_by(tell):
         reduction = preparation.run()
     fit, number = reduction.fit, len(reduction.detection.sources)
-    tell(f"{_described(fit)}, {fit.seconds:.0f} s, detector pattern: {reduction.pattern_origin}")
+    tell(
+        f"{fit.status.name}, chi2 per pixel {fit.chi2_per_pixel:.3g}, {fit.seconds:.0f} s, "
+        f"detector pattern: {reduction.pattern_origin}"
+    )
     tell(f"{counted(number, 'companion')} detected")
     warn_of_status(science[0].name, fit)
     if references and not reduction.reference_frames:
@@ -371,11 +366,6 @@ def _requested_pattern(
             "klip_dataset"
         )
     return as_request(requested)
-
-
-def _described(result: Refinement) -> str:
-    """How a fit ended, in a few words."""
-    return f"{result.status.name}, chi2 per pixel {result.chi2_per_pixel:.3g}"
 
 
 def model_of(

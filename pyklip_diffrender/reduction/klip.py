@@ -27,6 +27,7 @@ from pyklip_diffrender.detection.field import pixels_of
 from pyklip_diffrender.detection.tails import student_snr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.progress import counted
 from pyklip_diffrender.io.tables import add_columns
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.optics.grid import fft_convolve
@@ -44,17 +45,8 @@ _MOST_KL_MODES = 5
 _INNER_RADIUS_LAMBDA_D = 1.4
 """Radius in lambda/D within which KLIP does not subtract the star."""
 
-_FIRST = 2
-"""Smallest of the default separations, lambda/D."""
-
-_COUNT = 12
-"""Number of the default separations."""
-
 _TRIALS = 4
 """Position angles at which planets are injected at every separation."""
-
-_TURN_DEG = 137.5
-"""Degrees from the planets at one separation to the planets at the next."""
 
 _OTHER_ROLL_DEG = 1.0
 """Degrees between rolls that are references of each other."""
@@ -66,13 +58,8 @@ _CLOSE_PIXELS = 1.5
 """Pixels about the position of an injected planet in which its peak is sought."""
 
 
-def klip_rdi(
-    target: NDArray[np.float64],
-    references: NDArray[np.float64],
-    *,
-    numbasis: int = 9,
-) -> NDArray[np.float64]:
-    """Subtract the star from `target` (ny, nx) with pyKLIP's reference differential imaging.
+def klip_rdi(target: Image, references: Image) -> Image:
+    """Subtract the star from `target` (ny, nx) with nine modes of pyKLIP's RDI.
 
     The star is in the middle of the array; `references` are (frames, ny, nx). The result, (ny, nx),
     is NaN in the innermost pixel and outside the largest annulus.
@@ -108,7 +95,7 @@ def klip_rdi(
             fileprefix="klip",
             annuli=5,
             subsections=4,
-            numbasis=[numbasis],
+            numbasis=[9],
             movement=0,
             psf_library=library,
             aligned_center=center,
@@ -137,7 +124,7 @@ def klip_curve(
     # The corners' smaller coordinates.
     edge = np.abs(klip.grid[[0, -1], [0, -1]]).min() - resolution / 2
     if separations is None:
-        separations = np.geomspace(_FIRST * resolution, max(edge, _FIRST * resolution), _COUNT)
+        separations = np.geomspace(2 * resolution, max(edge, 2 * resolution), 12)
     separations = np.atleast_1d(to_arcsec(separations, "separations"))
     separations = separations[separations <= edge]
     if not len(separations):
@@ -159,8 +146,8 @@ def klip_curve(
     response, alone = np.zeros_like(noise), np.zeros(len(separations))
     for s, separation in enumerate(separations):
         # Evenly spread at every separation, and from one separation to the next by the golden
-        # angle, so that no direction is preferred.
-        angles = np.radians(_TURN_DEG * s + 360 / _TRIALS * np.arange(_TRIALS))
+        # angle, 137.5 degrees, so that no direction is preferred.
+        angles = np.radians(137.5 * s + 360 / _TRIALS * np.arange(_TRIALS))
         wanted = separation * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         rows, columns = np.array([klip.pixel(each) for each in wanted]).T
         light = templates.at_pixels(rows, columns)
@@ -181,8 +168,9 @@ def klip_curve(
     best = limits.argmin(axis=0), np.arange(len(separations))
     limit = np.where(np.isfinite(limits[best]), limits[best], np.nan)
     corrected = limit * small_sample_factor(separations, resolution, _LIMIT_SNR)
+    label = klip.label(klip.modes[0], klip.modes[-1])
     return add_columns(
-        QTable(meta={"sigmas": _LIMIT_SNR, "resolution_arcsec": resolution, "label": klip.label}),
+        QTable(meta={"sigmas": _LIMIT_SNR, "resolution_arcsec": resolution, "label": label}),
         [
             ("separation", separations, u.arcsec, ".3f", "from the star"),
             ("contrast", limit, None, ".2e", "limit with the best number of modes"),
@@ -202,25 +190,23 @@ def _has_limits(detection: Detection, grid: Image) -> NDArray[np.bool_]:
 
 def klip_image(
     detection: Detection,
-    references: Sequence[Observation] = (),
-    science: Sequence[Observation] | None = None,
-    *,
-    modes: int = _MOST_KL_MODES,
-    north: float = 0.0,
+    references: Sequence[Observation],
+    science: Sequence[Observation] | None,
+    modes: int,
 ) -> tuple[Image, Image, str]:
     """Subtract the star from the frames that were searched with KLIP, and combine them.
 
     Returns the image (ny, nx) in the data's unit, NaN close to the star, turned counter-clockwise
-    by `north` degrees from the first frame; x, y (ny, nx, 2) of its pixels from the star, arcsec;
+    to the orientation of `Detection.north`; x, y (ny, nx, 2) of its pixels from the star, arcsec;
     and a label. `science` takes the place of the fit's frames, from which a disk may have been
     subtracted.
     """
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
     klip = KlipSubtraction(detection.templates, references, resolution, science)
     used = min(modes, len(klip.modes))
-    image = klip.residuals(klip.science, north)[used - 1]
+    image = klip.residuals(klip.science, detection.north)[used - 1]
     shown = np.where(klip._zone, image, np.nan)
-    return shown, klip.grid, klip.label_of(used)
+    return shown, klip.grid, klip.label(used, used)
 
 
 def small_sample_factor(
@@ -311,22 +297,14 @@ class KlipSubtraction:
         """Peak of a planet of contrast 1 in a smoothed image before any subtraction."""
         self._kernel = kernel[::-1, ::-1] / self.norm
 
-    @property
-    def label(self) -> str:
-        """Observing strategies, number of reference frames and of modes."""
-        return self.label_of(self.modes[0], self.modes[-1])
-
-    def label_of(self, fewest: int, most: int | None = None) -> str:
-        """The label for a number of modes, or for a range."""
-        most = most or fewest
+    def label(self, fewest: int, most: int) -> str:
+        """Observing strategies, number of reference frames, and a range of numbers of modes."""
         strategies = ["ADI"] if any(self._library) else []
-        reference = f"{len(self.references)} reference frame"
+        reference = "other roll" if len(self.rolls) == 2 else "other rolls"
         if self.references:
             strategies.append("RDI")
-            reference += "" if len(self.references) == 1 else "s"
-        else:
-            reference = "other roll" if len(self.rolls) == 2 else "other rolls"
-        modes = f"{'' if fewest == most else f'{fewest} to '}{most} mode{'' if most == 1 else 's'}"
+            reference = counted(len(self.references), "reference frame")
+        modes = f"{'' if fewest == most else f'{fewest} to '}{counted(most, 'mode')}"
         return f"KLIP {'+'.join(strategies)} ({reference}, {modes})"
 
     def pixel(self, place: Image) -> tuple[int, int]:

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pyklip_diffrender import drawing
+from pyklip_diffrender.io.progress import counted
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -23,20 +25,14 @@ if TYPE_CHECKING:
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-_SENTENCE_LIMIT_ARCSEC = 1.5
-"""Separation, arcsec, near which the first sentence states the limit."""
-
-_RECENT_DAYS = 7.0
-"""Days from the frames to an OPD map up to which it passes without a remark: maps are made
-every two days, and one of a week before is rarely the nearest."""
-
 _SMALLEST_STATED_PROBABILITY = 1e-9
 """Probabilities below this rest on tails that no noise is known to follow."""
 
 
 def remark_on_map(days: float | None) -> str:
     """Remark on an OPD map so many days from the frames; empty for one of the same week."""
-    if days is None or abs(days) <= _RECENT_DAYS:
+    # Maps are made every two days, and one of a week before is rarely the nearest.
+    if days is None or abs(days) <= 7:
         return ""
     return (
         f"The OPD map was sensed {abs(days):.0f} days "
@@ -69,11 +65,16 @@ def _outside(summary: Mapping[str, Any]) -> str:
         "more candidate": shapes.count("point"),
         "extended or blended source": shapes.count("extended"),
     }
-    counts = [f"{n} {kind}{'' if n == 1 else 's'}" for kind, n in kinds.items() if n]
+    counts = [counted(n, kind) for kind, n in kinds.items() if n]
     if not counts:
         return "Nothing was found farther from the star, in the whole frames."
     verb = "is" if next(filter(None, kinds.values())) == 1 else "are"
     return f"Farther from the star, in the whole frames, there {verb} {' and '.join(counts)}."
+
+
+def some_candidates(number: int) -> str:
+    """A number of candidates, such as "no candidates"."""
+    return counted(number, "candidate") if number else "no candidates"
 
 
 def _extended(summary: Mapping[str, Any]) -> str:
@@ -104,12 +105,10 @@ def _compact(summary: Mapping[str, Any]) -> str:
 
 
 def _limit(summary: Mapping[str, Any]) -> Sequence[str]:
-    """The faintest planet that would have been seen, if that is known anywhere."""
+    """The faintest planet that would have been seen near 1.5 arcsec, if that is known anywhere."""
     if not summary["limits"]:
         return []
-    row = min(
-        summary["limits"], key=lambda each: abs(each["separation_arcsec"] - _SENTENCE_LIMIT_ARCSEC)
-    )
+    row = min(summary["limits"], key=lambda each: abs(each["separation_arcsec"] - 1.5))
     threshold = summary["threshold_snr"]
     contrast = row["contrast"] * threshold / summary["contrast_curve"]["sigmas"]
     return [
@@ -231,14 +230,14 @@ class Picture:
         return f"data:image/png;base64,{b64encode(drawing.to_png(self.figure)).decode()}"
 
 
+def curve_arrays(curve: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Separations and contrasts of a curve in a summary, NaN for what is not known."""
+    return np.array(curve["separation_arcsec"], float), np.array(curve["contrast"], float)
+
+
 def render(template: str, **values: Any) -> str:
     """Make a page of a template; all values are escaped: headers of files may hold anything."""
     return _environment().get_template(template).render(values)
-
-
-def count(number: int, noun: str) -> str:
-    """A number with its noun, in the plural where it needs one."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _unbroken(text: str) -> str:
@@ -260,7 +259,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters |= {
-        "count": count,
+        "count": counted,
         "number": number,
         "path": quote,
         "plus_minus": plus_minus,

@@ -26,10 +26,10 @@ from pyklip_diffrender.detection import (
     image_hdu,
 )
 from pyklip_diffrender.imaging import SkyModel
-from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.headers import fits_unit
 from pyklip_diffrender.io.units import rotation_matrix
-from pyklip_diffrender.reduction.pages import Picture, number
+from pyklip_diffrender.reduction.pages import Picture, number, some_candidates
 from pyklip_diffrender.reduction.pipeline import ReductionResult
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.scene.observation import Window
@@ -46,7 +46,8 @@ class SkyImages:
 
     def __init__(self, reduction: ReductionResult) -> None:
         self.detection: Detection = reduction.detection
-        self._disk, self._is_quick = reduction.disk, reduction.accuracy == "quick"
+        # Extended light, which the combined image has and the others lack.
+        self.disk, self._is_quick = reduction.disk, reduction.accuracy == "quick"
         self._templates = self.detection.templates
         observation = self.detection.observation
         self.oriented = observation.position_angles is not None
@@ -61,8 +62,8 @@ class SkyImages:
         """Mean of the frames minus the star, and its standard deviation, in the frames' unit."""
         images, errors = {}, {}
         lights: Sequence[Any] = [0.0] * len(self._templates.frames)
-        if self._disk is not None:
-            lights = self._disk.light
+        if self.disk is not None:
+            lights = self.disk.light
         # Frames of reference stars may be among those that were fitted.
         for (k, frame), light in zip(self._templates.frames.items(), lights, strict=True):
             subtracted = self.detection.subtracted[k]
@@ -109,11 +110,6 @@ class SkyImages:
         error = detection.error / detection.error_factor.of(detection.grid)
         return self.turned((detection.photon_error / error) ** 2)
 
-    @property
-    def has_disk(self) -> bool:
-        """Whether extended light was fitted, which the combined image has and the others lack."""
-        return self._disk is not None
-
     def turned(self, on_frame: Image) -> Image:
         """Interpolate an image on the pixels of the first frame."""
         offsets = torch.from_numpy((self.grid @ self.to_sky).reshape(-1, 2))
@@ -131,12 +127,10 @@ class SkyImages:
             "COMBINED_ERROR": (error, unit),
             "THROUGHPUT": (self.throughput, ""),
             "POSTERIOR_MEAN": (self.posterior_mean, unit),
-            # It takes a fifth of the time of a first look's products.
-            **(
-                {}
-                if self._is_quick
-                else {"POSTERIOR_MEAN_ERROR": (self.posterior_mean_error, unit)}
-            ),
+        }
+        if not self._is_quick:  # It takes a fifth of the time of a first look's products.
+            images["POSTERIOR_MEAN_ERROR"] = (self.posterior_mean_error, unit)
+        images |= {
             "CONTRAST": (self.turned(detection.contrast), ""),
             "CONTRAST_ERROR": (self.turned(detection.error), ""),
             "SNR": (self.turned(detection.snr), ""),
@@ -144,8 +138,7 @@ class SkyImages:
         wcs = world_coordinates(self.grid @ self.to_sky, detection.observation)
         first = primary_hdu(detection.observation, detection.provenance, detection.sky.mjd)
         hdus = [image_hdu(image, name, unit, wcs) for name, (image, unit) in images.items()]
-        with replacing(path) as temporary:
-            fits.HDUList([first, *hdus]).writeto(temporary, overwrite=True, checksum=True)
+        write_fits(fits.HDUList([first, *hdus]), path)
         return path
 
 
@@ -181,9 +174,7 @@ class Klip:
 
             curve = klip_curve(detection, sequence.references)
             modes = int(np.median(curve["modes"]))
-            image = klip_image(
-                detection, sequence.references, science, modes=modes, north=detection.north
-            )
+            image = klip_image(detection, sequence.references, science, modes)
         except Exception as error:  # An addition to the report, which is complete without it.
             _log.warning("the report has no comparison with KLIP: %s", error)
             return None
@@ -209,7 +200,7 @@ class Overview:
             "without_star",
             *(() if self.klip is None else ("klip",)),
             # With a disk in the model that image would lack its light.
-            *(() if self.images.has_disk else ("most_probable",)),
+            *(("most_probable",) if self.images.disk is None else ()),
             "snr",
         )
 
@@ -297,9 +288,7 @@ class ReportPictures:
 
 def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     """The frames without the star, KLIP's beside them, and the S/N map; north is up."""
-    count = len(summary["candidates"])
-    some = f"{count or 'no'} candidate{'' if count == 1 else 's'}"
-    some += f" above S/N {summary['threshold_snr']:g}"
+    some = f"{some_candidates(len(summary['candidates']))} above S/N {summary['threshold_snr']:g}"
     up = "north up" if summary["oriented"] else "oriented like the first frame"
     words = {
         "without_star": (
@@ -317,10 +306,10 @@ def _overview(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
     }
     if overview.klip is not None:
         words["klip"] = f"Mean of the same frames after {overview.klip.label}, on the same scale."
-    figures, axes = _panels(len(overview.panels))
+    axes = [drawing.panel() for _ in overview.panels]
     for ax, panel in zip(axes, overview.panels, strict=True):
         overview.draw(ax, panel)
-    return _pictures(figures, [words[each] for each in overview.panels])
+    return _pictures(axes, [words[each] for each in overview.panels])
 
 
 def _curve(
@@ -341,46 +330,36 @@ def _curve(
         "the best number of modes at every separation; its noise is the scatter in a ring without "
         "the candidates, its throughput is measured with injected planets."
     )
-    figure, ax = drawing.wide_panel()
+    ax = drawing.wide_panel()
     draw_curve(ax, detection, klip, legend_below=True)
     caption = (
         f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}, against "
         "separation: the median of all position angles and their range. "
         f"Dashed: the limit for an exactly known star.{beside}{dotted}"
     )
-    return [Picture(figure, caption)]
+    return _pictures([ax], [caption])
 
 
 def _candidate(detection: Detection, place: int) -> list[Picture]:
     """Pixels of a candidate in every frame, by its place in the table."""
-    number = place + 1
     unit = drawing.unit_label(detection.observation.unit)
-    return [
-        Picture(
-            drawing.stamp_panels(stamp, unit),
-            f"Candidate {number} in frame {frame}{_roll(stamp.north)}: the data; without star, "
-            "background and other candidates; the model of the source, on the same scale; and what "
-            "is left, in standard deviations of the noise. The cross marks the fitted position.",
+    pictures = []
+    for frame, stamp in _stamps(detection, place).items():
+        roll = "" if stamp.north is None else f", +y at position angle {stamp.north:.1f} deg"
+        caption = (
+            f"Candidate {place + 1} in frame {frame}{roll}: the data; without star, background and "
+            "other candidates; the model of the source, on the same scale; and what is left, in "
+            "standard deviations of the noise. The cross marks the fitted position."
         )
-        for frame, stamp in _stamps(detection, place).items()
-    ]
-
-
-def _roll(north: float | None) -> str:
-    """The orientation of a frame as an apposition."""
-    return "" if north is None else f", +y at position angle {north:.1f} deg"
-
-
-def _source_of(detection: Detection, place: int) -> int:
-    """Place among the sources, which are in the order they were found, of a row of the table."""
-    # The table is in the order of the S/N.
-    return int(np.argsort(-detection.sources.snr(detection.error_factor))[place])
+        pictures.append(Picture(drawing.stamp_panels(stamp, unit), caption))
+    return pictures
 
 
 def _stamps(detection: Detection, place: int) -> dict[int, drawing.Stamp]:
     """The pixels about a candidate in the first frames that show some, by their number from 1."""
     templates, sources = detection.templates, detection.sources
-    index = _source_of(detection, place)
+    # Sources are in the order in which they were found, and the table in the order of the S/N.
+    index = int(np.argsort(-sources.snr(detection.error_factor))[place])
     offset = sources.offsets[index : index + 1]
     light, together = templates.at(offset), sources.light(templates)
     stamps = {}
@@ -417,10 +396,9 @@ def _stamps(detection: Detection, place: int) -> dict[int, drawing.Stamp]:
 
 def _wide(wide: WideField) -> list[Picture]:
     """The S/N map of the whole frames, and the contrast curve to their edge."""
-    figures, axes = _panels(2)
+    axes = [drawing.panel() for _ in range(2)]
     wide.plot(axes)
-    count = len(wide.candidates)
-    some = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {wide.threshold:g}"
+    some = f"{some_candidates(len(wide.candidates))} above S/N {wide.threshold:g}"
     oriented = wide.observation.position_angles is not None
     up = "north up" if oriented else "oriented like the first frame"
     ny, nx = wide.snr.shape
@@ -434,12 +412,12 @@ def _wide(wide: WideField) -> list[Picture]:
         ),
         "Contrast limit to the edge of the frames, as far as half of a ring is in them.",
     ]
-    return _pictures(figures, words)
+    return _pictures(axes, words)
 
 
 def _disk(disk: Disk) -> list[Picture]:
     """The frames without the star, and the extended light that was fitted."""
-    figures, axes = _panels(2)
+    axes = [drawing.panel() for _ in range(2)]
     disk.plot(axes)
     words = [
         (
@@ -452,30 +430,30 @@ def _disk(disk: Disk) -> list[Picture]:
             "coronagraph shows it in the first frame."
         ),
     ]
-    return _pictures(figures, words)
+    return _pictures(axes, words)
 
 
 def _injections(planets: QTable) -> list[Picture]:
     """Recovered over injected contrast."""
-    figure, ax = drawing.panel()
+    ax = drawing.panel()
     drawing.injected_planets(ax, planets)
     caption = (
         f"Recovered over injected contrast of {len(planets)} planets against separation. Filled: "
         "detected. Open: not detected, and measured at the known place."
     )
-    return [Picture(figure, caption)]
+    return _pictures([ax], [caption])
 
 
 def _completeness(fractions: QTable, curve: QTable) -> list[Picture]:
     """The fraction of planets that the search finds."""
     about = fractions.meta
-    figure, ax = drawing.panel()
+    ax = drawing.panel()
     drawing.completeness(ax, fractions, curve, about["contrast_50"], about["contrast_95"])
     caption = (
         "Fraction of planets that the search finds, by contrast and separation. Dashed: 50 %; "
         "solid: 95 %; dotted: the contrast curve at 5 sigma."
     )
-    return [Picture(figure, caption)]
+    return _pictures([ax], [caption])
 
 
 def _star(reduction: ReductionResult, frame: int) -> list[Picture]:
@@ -509,7 +487,7 @@ def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[P
     fit, about = reduction.fit, summary["opd"]
     before, after = wavefronts(fit)
     rms = [number(about[f"{key}rms_nm"], ".1f", "nm") for key in ("", "refined_", "change_")]
-    figures, axes = _panels(3)
+    axes = [drawing.panel() for _ in range(3)]
     width = fit.model.diameter
     limit = float(np.nanpercentile(np.abs([before, after]), 99.5)) or 1.0
     drawing.opd_map(axes[0], before, width, title="Before the fit", limit=limit)
@@ -524,7 +502,7 @@ def _wavefront(reduction: ReductionResult, summary: Mapping[str, Any]) -> list[P
             "from the prior."
         ),
     ]
-    return _pictures(figures, words)
+    return _pictures(axes, words)
 
 
 def _of_frame(detection: Detection, frame: int) -> list[Any]:
@@ -535,7 +513,7 @@ def _of_frame(detection: Detection, frame: int) -> list[Any]:
     data = np.where(valid, observation.data[0], np.nan)
     north = observation.north
     norm, unit = drawing.light_norm(data, noise[valid]), drawing.unit_label(observation.unit)
-    figures, axes = _panels(3)
+    axes = [drawing.panel() for _ in range(3)]
     for ax, image, title in ((axes[0], data, "Data"), (axes[1], part.star, "Model of the star")):
         drawing.star_image(ax, image, part.grid, norm, bar=unit, title=title, north=north)
     residual = detection.subtracted[frame] / noise
@@ -551,15 +529,9 @@ def _of_frame(detection: Detection, frame: int) -> list[Any]:
         linear=drawing.SNR_LINEAR,
         north=north,
     )
-    return figures
+    return axes
 
 
-def _panels(count: int) -> tuple[list[Any], list[Any]]:
-    """Figures with one axes each, and these axes."""
-    panels = [drawing.panel() for _ in range(count)]
-    return [figure for figure, _ in panels], [ax for _, ax in panels]
-
-
-def _pictures(figures: Sequence[Any], captions: Sequence[str]) -> list[Picture]:
-    """Figures with their captions."""
-    return [Picture(*each) for each in zip(figures, captions, strict=True)]
+def _pictures(axes: Sequence[Any], captions: Sequence[str]) -> list[Picture]:
+    """The figures of axes with their captions."""
+    return [Picture(ax.figure, caption) for ax, caption in zip(axes, captions, strict=True)]

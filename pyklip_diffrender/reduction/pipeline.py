@@ -29,10 +29,7 @@ from pyklip_diffrender.detection import (
     wide_field,
     without_blurred_edges,
 )
-from pyklip_diffrender.errors import (
-    DiffrenderError,
-    DiffrenderWarning,
-)
+from pyklip_diffrender.errors import DiffrenderError, DiffrenderWarning
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.io.tables import html_summary
 from pyklip_diffrender.io.units import to_bytes
@@ -151,20 +148,17 @@ class ReductionResult:
 
     def __str__(self) -> str:
         known = "none" if self.pattern is None else f"from {self.pattern.name}"
-        return (
-            f"{self.sequence!r}\n{self._status}\n"
-            f"detector pattern: {known}\n{self._references}{self.search}\n{self.remark}"
-        ).rstrip()
+        references = self.visit.in_words() if self.visit.contributions else ""
+        lines = (
+            repr(self.sequence), self._status, f"detector pattern: {known}", references,
+            str(self.search), self.remark,
+        )  # fmt: skip
+        return "\n".join(filter(None, lines))
 
     @property
     def search(self) -> Detection | WideField:
         """The search of the whole frames, if it was asked for, else of the fitted pixels."""
         return self.detection if self.wide is None else self.wide
-
-    @property
-    def _references(self) -> str:
-        """Use of the frames of reference stars, in a line; empty without any."""
-        return f"{self.visit.in_words()}\n" if self.visit.contributions else ""
 
     def _repr_html_(self) -> str:
         facts = {
@@ -301,6 +295,9 @@ class Preparation:
     settings: FitSettings | None = None
     # The wavefront to start from at another date; None for the same at all dates.
     opd_at: Callable[[Time | None], OPDMap] | None = None
+    progress: bool = False
+    # Gets the products so far, before the next stage begins.
+    keep: Callable[[ReductionResult], object] | None = None
 
     def run(
         self,
@@ -313,31 +310,22 @@ class Preparation:
         `keep` gets the products so far, before the next stage begins.
         """
         with numbered_stages():
-            return _Run(self, progress, keep).result()
+            return replace(self, progress=progress, keep=keep)._result()
 
-
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """The steps of a reduction."""
-
-    preparation: Preparation
-    progress: bool
-    keep: Callable[[ReductionResult], object] | None = None
-
-    def result(self) -> ReductionResult:
-        options = self.preparation.options
+    def _result(self) -> ReductionResult:
+        options = self.options
         self._require_possible_flux()
         choice, fit = fit_with_pattern(
-            self.preparation.sequence.science,
+            self.sequence.science,
             self._teaching,
-            self.preparation.model,
-            self.preparation.wavefront,
+            self.model,
+            self.wavefront,
             self._first_fit,
             pattern=options.pattern,
-            settings=self.preparation.settings,
+            settings=self.settings,
             memory=options.memory,
             progress=self.progress,
-            opd_at=self.preparation.opd_at,
+            opd_at=self.opd_at,
         )
         fit, visit, detection = self._with_references(fit, choice)
         self._say_what_is_unused(visit)
@@ -345,7 +333,7 @@ class _Run:
         wide: WideField | None = None
         injections: QTable | None = None
         fractions: QTable | None = None
-        sequence = replace(self.preparation.sequence, science=choice.science)
+        sequence = replace(self.sequence, science=choice.science)
 
         def reduction() -> ReductionResult:
             assert detection is not None
@@ -401,7 +389,7 @@ class _Run:
         self, detection: Detection, visit: Visit, choice: PatternChoice
     ) -> tuple[WideField, Detection, Visit]:
         """Search the whole frames; the star is fitted again without the light of what is there."""
-        whole = self.preparation.whole.science
+        whole = self.whole.science
         with stage("whole frames"):
             wide = wide_field(detection, whole)
         cleaned = wide.subtracted(whole, choice.science)
@@ -415,8 +403,7 @@ class _Run:
     @cached_property
     def _beyond(self) -> tuple[Planet, ...]:
         """Bright sources beyond the fitted pixels, to be fitted with the star."""
-        prepared = self.preparation
-        whole, cut = prepared.whole.science, prepared.sequence.science
+        whole, cut = self.whole.science, self.sequence.science
         if not any(map(has_bright_pixels_beyond, whole, cut)):
             return ()
 
@@ -442,9 +429,8 @@ class _Run:
 
     def _aligned(self, science: tuple[Observation, ...]) -> Refinement:
         """Fit place, flux and background of frames with the wavefront of the map."""
-        prepared = self.preparation
         settings = replace(
-            prepared.settings or settings_for(science[0]),
+            self.settings or settings_for(science[0]),
             wavefront=False,
             companions=(),
             max_companions=0,
@@ -452,19 +438,19 @@ class _Run:
             max_iterations=_ALIGNMENT_STEPS,
         )
         return refine(
-            prepared.model,
+            self.model,
             science,
-            prepared.wavefront,
+            self.wavefront,
             settings=settings,
-            start=prepared.options.start,
+            start=self.options.start,
             progress=self.progress,
         )
 
     def _require_possible_flux(self) -> None:
         """Find a flux of the star in a mistaken unit before the wavefront is fitted."""
-        stated = self.preparation.options.star_flux
+        stated = self.options.star_flux
         if stated is not None:
-            aligned = self._aligned(self.preparation.sequence.science)
+            aligned = self._aligned(self.sequence.science)
             if aligned.status.usable:
                 require_agreement_of_flux(aligned, to_jansky(stated))
 
@@ -475,16 +461,16 @@ class _Run:
 
     def _fit(self, science: Iterable[Observation], choice: PatternChoice) -> Refinement:
         """Fit the frames of the target; roughly, if reference stars are to join them."""
-        options, settings = self.preparation.options, choice.settings
+        options, settings = self.options, choice.settings
         if self._beyond:
             settings = settings or settings_for(choice.science[0])
             settings = replace(settings, companions=(*settings.companions, *self._beyond))
         if self._joins_early(choice):
             settings = rough_settings(settings or settings_for(choice.science[0]))
         fit = refine(
-            self.preparation.model,
+            self.model,
             tuple(science),
-            self.preparation.wavefront,
+            self.wavefront,
             settings=settings,
             start=options.start,
             pattern=choice.pattern,
@@ -501,7 +487,7 @@ class _Run:
         """Fit the star again with the sources that begin just beyond the fitted pixels."""
         # A fit that has failed has no star beyond its pixels.
         usable = fit.status.usable
-        sources = sources_at_edges(fit, self.preparation.whole.science) if usable else ()
+        sources = sources_at_edges(fit, self.whole.science) if usable else ()
         if not sources:
             return fit
         for each in sources:
@@ -514,11 +500,11 @@ class _Run:
 
     @property
     def _joining(self) -> tuple[Observation, ...]:
-        return frames_in_likelihood(self.preparation.sequence, self.preparation.options)
+        return frames_in_likelihood(self.sequence, self.options)
 
     @property
     def _teaching(self) -> tuple[Observation, ...]:
-        return frames_for_pattern(self.preparation.sequence, self.preparation.options)
+        return frames_for_pattern(self.sequence, self.options)
 
     def _joins_early(self, choice: PatternChoice) -> bool:
         """Whether the fit of the target alone is only the beginning of the fit of all frames."""
@@ -528,7 +514,7 @@ class _Run:
 
     def _with_references(self, fit: Refinement, choice: PatternChoice) -> Joined:
         """Fit target and reference stars together."""
-        memory = self.preparation.options.memory
+        memory = self.options.memory
         joined = with_references(
             fit,
             choice,
@@ -557,10 +543,10 @@ class _Run:
         fitted = {f.observation.name for fit in choice.references for f in fit.frames} & taught
         known = {each.name: each for each in joined.visit.contributions}
         contributions = []
-        for each in self.preparation.sequence.references:
+        for each in self.sequence.references:
             own = known.get(each.name) or Contribution(each.name, each.target, "not used")
             if own.use == "not used" and each.name in fitted:
-                is_far = any(each is one for one in self.preparation.sequence.other_epochs)
+                is_far = any(each is one for one in self.sequence.other_epochs)
                 own = replace(own, use="pattern", reason=OF_ANOTHER_EPOCH if is_far else own.reason)
             elif not own.reason and own.use == "not used":
                 own = replace(own, reason=self._why_unused(each, joined.fit, choice))
@@ -575,8 +561,8 @@ class _Run:
         if failed is not None:
             return failed
         if not any(each is reference for each in self._teaching):
-            return f"the option references is {self.preparation.options.references!r}"
-        is_near = any(each is reference for each in self.preparation.sequence.same_epoch)
+            return f"the option references is {self.options.references!r}"
+        is_near = any(each is reference for each in self.sequence.same_epoch)
         where = "" if is_near else f"{OF_ANOTHER_EPOCH}, and "
         why = {
             "library": "the library knows the pattern (pattern='references' adds theirs)",
@@ -590,25 +576,24 @@ class _Run:
         if not visit.contributions:
             return
         (_log.warning if visit.unused else _log.info)("%s", visit.in_words())
-        sequence, options = self.preparation.sequence, self.preparation.options
-        named = any(row.is_named for row in sequence.rows if row.use == "reference")
-        asked = named or options.pattern == "references"
+        named = any(row.is_named for row in self.sequence.rows if row.use == "reference")
+        asked = named or self.options.pattern == "references"
         if asked and len(visit.unused) == len(visit.contributions):
             warnings.warn(
-                f"{sequence.target}: no frame of a reference star is used: {visit.in_words()}",
+                f"{self.sequence.target}: no frame of a reference star is used: {visit.in_words()}",
                 DiffrenderWarning,
                 stacklevel=2,
             )
 
     def _require_plausible(self, fit: Refinement) -> None:
-        limit = self.preparation.options.max_chi2
+        limit = self.options.max_chi2
         if limit is not None:
             require_plausible(fit.frames[0].observation.name, fit, limit)
 
     def _search(self, fit: Refinement, disk: Disk | None = None) -> Detection:
         return detect(
             fit,
-            threshold=self.preparation.options.threshold,
+            threshold=self.options.threshold,
             without_limits=None if disk is None else disk.hides_points,
             progress=self.progress,
         )
@@ -632,7 +617,7 @@ class _Run:
             return self._search(again.fit, again)
 
         try:
-            return recover_planets(detection, self.preparation.options.injections, search)
+            return recover_planets(detection, self.options.injections, search)
         except DiffrenderError as error:  # The reduction is complete without it.
             _log.warning("no planets were injected: %s", error)
             return None

@@ -11,9 +11,9 @@ from typing import Any
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import CorruptFileError
-from pyklip_diffrender.io.files import OutputFolder, read_text, replacing, write_table
+from pyklip_diffrender.io.files import OutputFolder, read_text, write_page, write_table
+from pyklip_diffrender.io.progress import counted
 from pyklip_diffrender.reduction.pages import (
-    count,
     depth_against_klip,
     number,
     plus_minus,
@@ -102,8 +102,8 @@ def _setup(summary: Mapping[str, Any]) -> str:
         summary["image_mask"],
         summary["program"] and f"program {summary['program']}",
         " to ".join(dict.fromkeys(filter(None, dates))),
-        count(len(targets), "frame") + " of the target",
-        f"{count(len(uses), 'frame')} of reference stars: {', '.join(purposes)}" if uses else None,
+        f"{counted(len(targets), 'frame')} of the target",
+        uses and f"{counted(len(uses), 'frame')} of reference stars: {', '.join(purposes)}",
         summary["exposure_s"] and f"{summary['exposure_s']:.0f} s on the target",
     ]
     return " · ".join(str(part) for part in parts if part)
@@ -132,7 +132,8 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _chi2(value: float | None) -> str:
     """Reduced chi-squared, and what it means where it is below 1."""
-    if value is None or value >= _SMALL_CHI2:
+    # Of 1,600 pixels, the smallest number that is fitted as a rule, it has a deviation of 0.035.
+    if value is None or value >= 0.9:
         return number(value)
     return (
         f"{number(value)}; below 1 because the errors of the frames are larger than their noise, "
@@ -176,11 +177,6 @@ def _provenance(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-_SMALL_CHI2 = 0.9
-"""Reduced chi-squared below which errors are larger than the noise: of 1,600 pixels, which is the
-smallest number that is fitted as a rule, it has a standard deviation of 0.035."""
-
-
 # The files that a reduction writes.
 
 PRODUCTS = {
@@ -210,18 +206,12 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """Read ``summary.json`` of a folder; CorruptFileError if it is missing or damaged."""
     path = folder / "summary.json"
     try:
-        content: dict[str, Any] = json.loads(read_text(path))
-        return content
+        return json.loads(read_text(path))
     except (OSError, ValueError) as error:
         raise CorruptFileError(
             f"{path}: not the summary of a reduction ({error}). Expected a folder that "
             "Reduction.write wrote"
         ) from error
-
-
-def existing_products(folder: Path) -> list[Path]:
-    """Files in a folder that are called like products of a reduction."""
-    return [folder / name for name in PRODUCTS if (folder / name).exists()]
 
 
 def write_products(
@@ -275,7 +265,7 @@ class ProductFolder(OutputFolder):
         derivatives: bool = False,
         overwrite: bool = False,
     ) -> None:
-        super().__init__(folder, existing_products, overwrite=overwrite)
+        super().__init__(folder, PRODUCTS, overwrite=overwrite)
         self._derivatives = derivatives
 
     def keep(self, reduction: ReductionResult) -> list[Path]:
@@ -296,9 +286,5 @@ def write_report(
     pictures = ReportPictures.of(reduction, overview, summary)
     html, data = (folder / name for name in ("report.html", "summary.json"))
     about = {path.name: PRODUCTS.get(path.name, "") for path in (*files, html, data)}
-    text = page(summary, pictures, about)
-    written = {html: text, data: json.dumps(summary, indent=2, allow_nan=False) + "\n"}
-    for path, content in written.items():
-        with replacing(path) as temporary:
-            temporary.write_text(content, encoding="utf-8")
-    return list(written)
+    write_page(html, page(summary, pictures, about), data, summary)
+    return [html, data]

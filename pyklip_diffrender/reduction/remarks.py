@@ -42,11 +42,6 @@ _ADVICE = {
     ),
 }
 
-_REFERENCES = (
-    " The detector pattern was not known: add reference stars, or the pattern.fits of an "
-    "earlier reduction."
-)
-
 
 def require_plausible(name: str, result: Refinement, limit: float) -> None:
     """Raise RefinementError for a fit that failed, or has nothing to do with the frames."""
@@ -80,15 +75,17 @@ def warn_of_status(name: str, result: Refinement) -> None:
 
 def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
     """Advice about the status of a fit, with or without a known detector pattern."""
-    missing = _REFERENCES if status is Status.MODEL_MISMATCH and not patterned else ""
-    return f"{_ADVICE[status]}{missing} {remark}".rstrip()
+    parts = [_ADVICE[status]]
+    if status is Status.MODEL_MISMATCH and not patterned:
+        parts.append(
+            "The detector pattern was not known: add reference stars, or the pattern.fits of an "
+            "earlier reduction."
+        )
+    return " ".join([*parts, remark]).rstrip()
 
 
 _CHANCE_PROBABILITY = 0.01
 """Probability below which unrelated sources are not taken to be arranged by chance."""
-
-_NEIGHBOURS_LAMBDA_D = 1.5
-"""Separation of neighbours, lambda/D: one extended source is found as several this close."""
 
 
 def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
@@ -114,7 +111,7 @@ def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
     distances = np.hypot(*(places[:, None] - places).T)[np.triu_indices(count, 1)]
     # Each of the n (n - 1) / 2 pairs is within reach of each other with the probability
     # (reach / edge)^2, the ratio of two areas, so that their number is nearly Poisson's.
-    reach = _NEIGHBOURS_LAMBDA_D * resolution
+    reach = 1.5 * resolution  # One extended source is found as several this close.
     expected = len(distances) * (reach / edge) ** 2
     # The probability of n pairs or more is the regularised incomplete gamma function of n.
     if gammainc((distances < reach).sum(), expected) < _CHANCE_PROBABILITY:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,9 +18,18 @@ from numpy.typing import NDArray
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Combination, Detection, combine
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
-from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.files import write_page
+from pyklip_diffrender.io.progress import counted
 from pyklip_diffrender.options import SPECTRA
-from pyklip_diffrender.reduction.pages import Picture, plus_minus, probability, render, scientific
+from pyklip_diffrender.reduction.pages import (
+    Picture,
+    curve_arrays,
+    plus_minus,
+    probability,
+    render,
+    scientific,
+    some_candidates,
+)
 from pyklip_diffrender.scene.exposure import CatalogueStar, star_of
 
 COMPARISON = ("comparison.html", "comparison.json")
@@ -53,26 +61,21 @@ def write_comparison(
         "combined": combined,
     }  # fmt: skip
     page, data = (Path(folder) / name for name in COMPARISON)
-    texts = {
-        page: render(
-            "comparison.html",
-            target=target,
-            folders=folders,
-            shown=[
-                *_thumbnails(folders, Path(folder)),
-                *([] if isinstance(combination, str) else [_combined_map(combination)]),
-                *_limits(folders, combination),
-            ],
-            tracks=[] if isinstance(combination, str) else _tracks(combination),
-            combined=combined,
-            combined_table=None if "reason" in combined else combined_rows(combined),
-        ),
-        data: json.dumps(content, indent=2, allow_nan=False) + "\n",
-    }
-    for path, text in texts.items():
-        with replacing(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    return list(texts)
+    text = render(
+        "comparison.html",
+        target=target,
+        folders=folders,
+        shown=[
+            *_thumbnails(folders, Path(folder)),
+            *([] if isinstance(combination, str) else [_combined_map(combination)]),
+            *_limits(folders, combination),
+        ],
+        tracks=[] if isinstance(combination, str) else _tracks(combination),
+        combined=combined,
+        combined_table=None if "reason" in combined else combined_rows(combined),
+    )
+    write_page(page, text, data, content)
+    return [page, data]
 
 
 def _name(summary: Mapping[str, Any]) -> str:
@@ -94,19 +97,16 @@ def _thumbnails(folders: Mapping[str, Mapping[str, Any]], above: Path) -> list[P
         grid = scale * np.stack([x - header["CRPIX1"], y - header["CRPIX2"]], axis=-1)
         # East is to the left.
         places = np.array([_offset(each) for each in summary["candidates"]]).reshape(-1, 2)
-        figure, ax = drawing.panel()
+        ax = drawing.panel()
         drawing.snr_map(
             ax, snr, grid, places * (-1, 1), 0.0 if summary["oriented"] else None,
             title=_name(summary), labels=[str(k + 1) for k in range(len(places))],
         )  # fmt: skip
-        count = len(places)
-        some = f"{count or 'no'} candidate{'' if count == 1 else 's'}"
-        pictures.append(
-            Picture(
-                figure,
-                f"{_name(summary)}: S/N of a point source, {some}, numbered as in the table.",
-            )
+        caption = (
+            f"{_name(summary)}: S/N of a point source, {some_candidates(len(places))}, numbered as "
+            "in the table."
         )
+        pictures.append(Picture(ax.figure, caption))
     return pictures
 
 
@@ -114,7 +114,7 @@ def _combined_map(combination: Combination) -> Picture:
     """S/N of all reductions together, with one spectrum."""
     table, spectrum = combination.candidates, _shown_spectrum(combination)
     image = combination.snr[combination.spectra.names.index(spectrum)]
-    figure, ax = drawing.panel()
+    ax = drawing.panel()
     # East is to the left.
     drawing.snr_map(
         ax, image, combination.grid * (-1, 1),
@@ -122,7 +122,7 @@ def _combined_map(combination: Combination) -> Picture:
         labels=[str(k + 1) for k in range(len(table))],
     )  # fmt: skip
     return Picture(
-        figure,
+        ax.figure,
         f"All reductions together: S/N of a point source that does not move, with the spectrum "
         f"{spectrum}, numbered as in the table of the combined search.",
     )
@@ -140,9 +140,9 @@ def _limits(
 ) -> list[Picture]:
     """Contrast curves of the reductions, and the limits of all together; none without any."""
     curves = [
-        (_name(each), *_known(curve["separation_arcsec"], curve["contrast"]))
+        (_name(each), *curve_arrays(each["contrast_curve"]))
         for each in folders.values()
-        if (curve := each["contrast_curve"])["contrast"]
+        if each["contrast_curve"]["contrast"]
     ]
     if not curves:
         return []
@@ -157,16 +157,11 @@ def _limits(
         if len(table):
             contrast = np.asarray(table["contrast"]) * sigmas / table.meta["sigmas"]
             label = f"all together, in {table['filter'][0]}"
-            curves.append((label, *_known(table["separation"].value, contrast)))
+            curves.append((label, table["separation"].value, contrast))
             about = f"{about} All together: of a planet with the spectrum {name}."
-    figure, ax = drawing.panel()
+    ax = drawing.panel()
     drawing.survey_limits(ax, curves, [], sigmas)
-    return [Picture(figure, about)]
-
-
-def _known(separation: Any, contrast: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A curve as arrays, with NaN for what is not known."""
-    return np.array(separation, dtype=float), np.array(contrast, dtype=float)
+    return [Picture(ax.figure, about)]
 
 
 def _offset(candidate: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -198,16 +193,14 @@ def _tracks(combination: Combination) -> list[Picture]:
                     None if date == first else start + motion.background(first, date),
                 )
             )
-        figure, ax = drawing.panel()
+        ax = drawing.panel()
         drawing.sky_track(ax, drawn, start, f"Candidate {number}")
-        pictures.append(
-            Picture(
-                figure,
-                f"Candidate {number} of the combined search, filled, and where a source in the "
-                "background would be at the other dates, open and connected by the dashed line. A "
-                "companion stays, apart from its orbit.",
-            )
+        caption = (
+            f"Candidate {number} of the combined search, filled, and where a source in the "
+            "background would be at the other dates, open and connected by the dashed line. A "
+            "companion stays, apart from its orbit."
         )
+        pictures.append(Picture(ax.figure, caption))
     return pictures
 
 
@@ -321,11 +314,8 @@ def in_words(combination: Combination | str) -> str:
     """The result of a search over filters and epochs, or why there is none, in a few lines."""
     if isinstance(combination, str):
         return f"no combined search: {combination}"
-    count = len(combination.candidates)
-    lines = [
-        f"combined search of {len(combination.maps)} reductions: {count} "
-        f"candidate{'' if count == 1 else 's'}"
-    ]
+    count = counted(len(combination.candidates), "candidate")
+    lines = [f"combined search of {len(combination.maps)} reductions: {count}"]
     for row in combination.candidates:
         verdict = f", {row['verdict']}" if "verdict" in combination.candidates.colnames else ""
         lines.append(

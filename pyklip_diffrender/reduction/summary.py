@@ -103,11 +103,14 @@ def summarise(reduction: ReductionResult, klip: QTable | None = None) -> dict[st
         ],
         "settings": _settings(fit.settings),
         "seconds": sum(each.seconds for each in (fit, *reduction.references)),
-        "versions": _versions(),
+        "versions": {
+            "pyklip_diffrender": __version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in _STATED_LIBRARIES},
+        },
     }
     summary = {"sentence": sentence(summary), **summary}
-    plain: dict[str, Any] = _plain(summary)
-    return plain
+    return _plain(summary)
 
 
 def _status(reduction: ReductionResult) -> dict[str, Any]:
@@ -123,15 +126,6 @@ def _status(reduction: ReductionResult) -> dict[str, Any]:
         ),
         "usable": status.usable,
         "calibrated": status.calibrated,
-    }
-
-
-def _versions() -> dict[str, str]:
-    """Versions of the package, of Python and of the libraries that results depend on."""
-    return {
-        "pyklip_diffrender": __version__,
-        "python": platform.python_version(),
-        **{name: version(name) for name in _STATED_LIBRARIES},
     }
 
 

@@ -43,7 +43,7 @@ from pyklip_diffrender.detection import (
 from pyklip_diffrender.detection.field import ring_pixels
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.io.progress import stage
+from pyklip_diffrender.io.progress import counted, stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
 from pyklip_diffrender.refinement import (
     FitSettings,
@@ -190,7 +190,7 @@ class Visit:
         if counts["not used"]:
             reasons = dict.fromkeys(each.reason for each in self.unused)
             parts.append(f"{counts['not used']} not used by the fit: {'; '.join(reasons)}")
-        return f"of {total} reference frame{'' if total == 1 else 's'} {', '.join(parts)}"
+        return f"of {counted(total, 'reference frame')} {', '.join(parts)}"
 
 
 class Joined(NamedTuple):
@@ -301,7 +301,8 @@ def _kept(
         if gain > 1:
             return joint, together, gain, ""
         return f"limits would be {1 / gain:.2f} times those without it"
-    separations, gains = _stated_gains(alone, together)
+    separations, limits = stated_limits(alone)
+    gains = limits / np.interp(separations, *stated_limits(together))
     is_deeper = gains > 1
     if not is_deeper.any():
         return f"limits would be {1 / np.median(gains):.2f} times those without it"
@@ -532,15 +533,6 @@ def _light_errors(fit: Refinement) -> NDArray[np.float64]:
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
     errors = np.split(products.information.numpy() ** -0.5, ends)
     return fit.frames[0].star_light * np.array([np.median(each) for each in errors if len(each)])
-
-
-def _stated_gains(
-    alone: Detection, joint: Detection
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Separations, arcsec, and stated limits of one search over another's, by light."""
-    separations, limits = stated_limits(alone)
-    gains = limits / np.interp(separations, *stated_limits(joint))
-    return separations, gains
 
 
 def _drifts(joint: Refinement) -> NDArray[np.float64]:

@@ -31,12 +31,6 @@ from pyklip_diffrender.surveys.survey_page import page, row, table_of
 
 _log = logging.getLogger(__name__)
 
-_WORKER_MEMORY_SHARE = 0.8
-"""Memory that jobs are to take, as a fraction of the worker's, which is killed at 0.95."""
-
-_TABLES_WAIT_RATIO = 20.0
-"""The tables are written again after this many times the seconds that writing them took."""
-
 
 def survey(
     config: str | os.PathLike[str] | Mapping[str, Any],
@@ -95,7 +89,8 @@ def survey(
     limit = read_config(config).memory_limit
     work: Work = reduce_job
     if limit is not None:
-        work = partial(reduce_job, memory=_WORKER_MEMORY_SHARE * limit)
+        # A worker is killed at 0.95 of its memory.
+        work = partial(reduce_job, memory=0.8 * limit)
     return run_survey(config, output, work, scheduler, progress=progress)
 
 
@@ -200,7 +195,8 @@ class _Board:
             # There may be room again for the next job.
             _log.warning("%s", error)
         ended = time.monotonic()
-        self.next = ended + _TABLES_WAIT_RATIO * (ended - began)
+        # Writing them takes a twentieth of the time.
+        self.next = ended + 20 * (ended - began)
 
     def write(self) -> None:
         """Write tables and page; raises IncompatibleSetupError if they cannot be written."""

@@ -20,13 +20,10 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import measured_planet, with_planets
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, RefinementError
 from pyklip_diffrender.io.files import sha256
-from pyklip_diffrender.reduction import (
-    ReduceOptions,
-    ReductionResult,
-    prepare,
-    summarise,
-    write_products,
-)
+from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.reduction.pipeline import ReductionResult, prepare
+from pyklip_diffrender.reduction.products import write_products
+from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.refinement import FrameFit, Refinement, nircam_settings
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -208,17 +205,6 @@ def _circumstances(began: float) -> dict[str, Any]:
 
 # Jobs run in this process, or by the workers of dask.distributed.
 
-_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-
-_CONNECT_SECONDS = 30.0
-"""Seconds to wait for a scheduler."""
-
-_WITHOUT_WORKER_TIME = "10 minutes"
-"""Time without any worker on this machine after which jobs fail."""
-
-_FOLDER_WAIT_HALF_SECONDS = 20
-"""Half seconds to wait for a folder that another machine has made: network disks lag."""
-
 
 def in_this_process(todo: Sequence[Job], jobs: Path, work: Work) -> Iterator[tuple[Job, Record]]:
     """Run jobs one after the other; yields each with its record."""
@@ -252,7 +238,8 @@ def with_dask(
             stack.enter_context(config.set({
                 # A worker that is not back after this time is given up, by default after 15 s.
                 "distributed.deploy.lost-worker-timeout": "7 days",
-                "distributed.scheduler.no-workers-timeout": _WITHOUT_WORKER_TIME,
+                # Jobs fail when there was no worker for this time.
+                "distributed.scheduler.no-workers-timeout": "10 minutes",
                 # Dask makes glibc give freed memory back at once, which slows fits down.
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
             }))  # fmt: skip
@@ -265,7 +252,9 @@ def with_dask(
                     # Any free port; None would ask for a certain one, and warn.
                     dashboard_address="127.0.0.1:0",
                     silence_logs=logging.CRITICAL,
-                    env=dict.fromkeys(_THREADS, "1"),
+                    env=dict.fromkeys(
+                        ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
+                    ),
                 )
             except RuntimeError as error:
                 raise IncompatibleSetupError(
@@ -275,7 +264,7 @@ def with_dask(
                 ) from error
             address = stack.enter_context(cluster)
         try:
-            client = stack.enter_context(Client(address, timeout=_CONNECT_SECONDS))
+            client = stack.enter_context(Client(address, timeout=30))
         except (OSError, ValueError) as error:
             raise IncompatibleSetupError(
                 f"scheduler: got {scheduler!r}, where none answers ({error}). Start one with `dask "
@@ -332,7 +321,8 @@ def _record_of(future: Any, job: Job, jobs: Path) -> Record:
 
 def _appears(final: Path) -> bool:
     """Whether a job that has finished elsewhere is seen here, perhaps after a while."""
-    for _ in range(_FOLDER_WAIT_HALF_SECONDS):
+    # Network disks lag.
+    for _ in range(20):
         if finished(final):
             return True
         time.sleep(0.5)

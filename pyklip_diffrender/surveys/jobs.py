@@ -26,9 +26,6 @@ from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
 from pyklip_diffrender.wavefront.opd import opd_for
 from pyklip_diffrender.wavefront.opd_map import FLAT
 
-_KEY_DIGITS = 12
-"""Digits of the key at the end of the name of a folder."""
-
 
 @dataclass(frozen=True)
 class Injection:
@@ -207,7 +204,7 @@ def _with_planet(base: Job, planet: Injection) -> Job:
 
 def folder_of(label: str, key: str) -> str:
     """Name of a folder: what is in it, and the beginning of its key."""
-    return f"{file_name(label)}_{key[:_KEY_DIGITS]}"
+    return f"{file_name(label)}_{key[:12]}"
 
 
 def hash_of(facts: Mapping[str, Any]) -> str:
@@ -307,8 +304,7 @@ def write_record(folder: Path, job: Job, record: Mapping[str, Any]) -> Record:
     whole = encodable({**record, "job": about, "products": products})
     text = json.dumps(whole, indent=2, allow_nan=False) + "\n"
     (folder / RECORD).write_text(text, encoding="utf-8")
-    read: Record = json.loads(text)
-    return read
+    return json.loads(text)
 
 
 def encodable(value: Any) -> Any:

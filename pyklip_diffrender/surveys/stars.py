@@ -16,15 +16,15 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Combination, Detection
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.io.files import read_text, sha256
-from pyklip_diffrender.reduction import (
+from pyklip_diffrender.options import SPECTRA
+from pyklip_diffrender.reduction.products import read_summary
+from pyklip_diffrender.reduction.several import (
     COMPARISON,
-    SPECTRA,
     by_star,
     in_words,
     search_together,
     write_comparison,
 )
-from pyklip_diffrender.reduction.products import read_summary
 from pyklip_diffrender.surveys.jobs import Job, Record, clean, folder_of, hash_of, staged
 
 FOLDER = "combined"

@@ -6,15 +6,14 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
 from astropy import units as u
 from astropy.table import MaskedColumn, Table
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
-from pyklip_diffrender.io.progress import duration
-from pyklip_diffrender.reduction import COMPARISON
-from pyklip_diffrender.reduction.pages import Picture, count, render
+from pyklip_diffrender.io.progress import counted, duration
+from pyklip_diffrender.reduction.pages import Picture, curve_arrays, render
+from pyklip_diffrender.reduction.several import COMPARISON
 from pyklip_diffrender.reduction.summary import LIMITS_ARCSEC
 from pyklip_diffrender.surveys.jobs import Job, Record
 from pyklip_diffrender.surveys.stars import StarSearch
@@ -122,15 +121,16 @@ def page(jobs: Jobs, stars: Sequence[StarSearch] = ()) -> str:
     rows = [{**row(job, record), "label": str(job)} for job, record in jobs]
     states = [each["status"] for each in rows]
     done, failed, waiting = map(states.count, ("finished", "failed", "waiting"))
-    parts = [f"{done} of {count(len(rows), 'job')} finished"]
+    parts = [f"{done} of {counted(len(rows), 'job')} finished"]
     parts += [f"{failed} failed"] if failed else []
     parts += [f"{waiting} not finished yet"] if waiting else []
     names = list(dict.fromkeys(job.name for job, _ in jobs))
+    what = ", ".join(names) if len(names) <= 3 else counted(len(names), "sequence")
     seconds = sum(each["seconds"] or 0.0 for each in rows)
     injected = sum(job.injection is not None for job, _ in jobs)
     return render(
         "survey.html",
-        name=f"Survey of {', '.join(names) if len(names) <= 3 else count(len(names), 'sequence')}",
+        name=f"Survey of {what}",
         version=__version__,
         now=datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
         sentence=_sentence(jobs),
@@ -178,11 +178,11 @@ def _sentence(jobs: Jobs) -> str:
     counts = [len(result.get("candidates", ())) for _, result in _reduced(jobs)]
     if not counts:
         return "No sequence is reduced yet."
-    stars = count(len(counts), "sequence")
+    stars = counted(len(counts), "sequence")
     if not any(counts):
         return f"{stars} reduced, no companion candidate."
     return (
-        f"{stars} reduced, {count(sum(counts), 'companion candidate')} in "
+        f"{stars} reduced, {counted(sum(counts), 'companion candidate')} in "
         f"{sum(map(bool, counts))} of them."
     )
 
@@ -199,17 +199,12 @@ def _pictures(jobs: Jobs) -> list[Picture]:
         for each in result["candidates"]
         if each["contrast"] > 0
     ]
-    # NaN where a contrast is not known.
-    curves = [
-        (name, np.array(curve["separation_arcsec"], float), np.array(curve["contrast"], float))
-        for name, curve in ((name, result["curve"]) for name, result in results)
-    ]
+    curves = [(name, *curve_arrays(result["curve"])) for name, result in results]
     figure, axes = drawing.new_figure(1, 1)
     drawing.survey_limits(axes[0, 0], curves, candidates, sigmas)
-    picture = Picture(
-        figure,
-        "Contrast, relative to the star without coronagraph, that gives S/N "
-        f"{sigmas:g}, against separation, for {count(len(curves), 'sequence')}: the median of all "
-        f"position angles.{' Circles are candidates.' if candidates else ''}",
+    caption = (
+        f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}, against "
+        f"separation, for {counted(len(curves), 'sequence')}: the median of all position angles."
+        f"{' Circles are candidates.' if candidates else ''}"
     )
-    return [picture]
+    return [Picture(figure, caption)]
