@@ -10,11 +10,10 @@ A field given in an earlier one overrides the same field in a later one:
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -139,7 +138,7 @@ class DiffrenderSettings:
     image: Literal["cleaned", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None
-    model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    model_options: Mapping[str, Any] = field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
@@ -187,9 +186,9 @@ class DiffrenderSettings:
     def over(self, other: DiffrenderSettings) -> DiffrenderSettings:
         """Complete the settings from `other`."""
         merged: dict[str, Any] = {}
-        for name in (field.name for field in dataclasses.fields(self)):
-            own = getattr(self, name)
-            merged[name] = getattr(other, name) if own is None else own
+        for each in fields(self):
+            own = getattr(self, each.name)
+            merged[each.name] = getattr(other, each.name) if own is None else own
         merged["model_options"] = {**other.model_options, **self.model_options}
         return DiffrenderSettings(**merged)
 

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from astropy import units as u
@@ -32,10 +32,8 @@ from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.source_frames import (
     ATTRIBUTE,
     REFERENCES,
-    FrameDetails,
     NotRecordedError,
     Pointing,
-    Recorded,
     SourceFrames,
     part_of,
     pointings_of,
@@ -55,13 +53,6 @@ _log = logging.getLogger(__name__)
 # files.
 
 
-class Admitted(NamedTuple):
-    """Frames of a dataset that are used, and what else its files say."""
-
-    target: NDArray[np.bool_]  # (n,), frames of the target
-    references: tuple[Observation, ...]  # of reference stars, from the dataset and the library
-
-
 def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
     """Files of a PSF library's frames, if `JWSTData` read it while the backend was registered."""
     paths = [Path(path) for path in getattr(dataset, REFERENCES, ())]
@@ -73,14 +64,18 @@ def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
     return tuple(path for path in paths if path.name in names)
 
 
-def admit(source: SourceFrames, frames: NDArray[np.intp], library: Sequence[Path]) -> Admitted:
+def admit(
+    source: SourceFrames, frames: NDArray[np.intp], library: Sequence[Path]
+) -> tuple[NDArray[np.bool_], tuple[Observation, ...]]:
     """Judge the files of `frames`, indices in `source`, of one filter, and of the library.
 
+    Returns a mask (n,) of the frames of the target that are used, and the frames of reference
+    stars, from the dataset and the library.
     The target is the star of the first frame that is not marked as a reference (IS_PSF). Raises as
     `pyklip_diffrender.ExposureSequence.from_files`, and warns of every file that is not used, or
     not entirely.
     """
-    paths = [source.paths[k] for k in frames]
+    paths = [source.details[k].path for k in frames]
     sequence = _sequence(source, frames, paths, library)
     for row in sequence.rows:
         if row.remark:
@@ -106,7 +101,7 @@ def admit(source: SourceFrames, frames: NDArray[np.intp], library: Sequence[Path
             stacklevel=2,
         )
     used = [uses.get(path) == "target" and not a for path, a in zip(paths, again, strict=True)]
-    return Admitted(np.array(used), sequence.references)
+    return np.array(used), sequence.references
 
 
 def _sequence(
@@ -116,7 +111,7 @@ def _sequence(
     library: Sequence[Path],
 ) -> ExposureSequence:
     """Sort the files of frames and of the library, opening none twice."""
-    headers = [source.headers[k] for k in frames]
+    headers = [source.details[k].header for k in frames]
     first = next((k for k, h in enumerate(headers) if not is_reference(h)), 0)
     name = source.filenames[frames[first]]
     return ExposureSequence.of_opened(
@@ -201,8 +196,8 @@ def date_of_frames(dataset: Any) -> Time | None:
     if source is None:
         return None
     dates = [
-        beginning(header, name)
-        for header, name in zip(source.headers, source.filenames, strict=True)
+        beginning(each.header, name)
+        for each, name in zip(source.details, source.filenames, strict=True)
     ]
     known = [date for date in dates if date is not None]
     return Time(known).mean() if known else None
@@ -239,58 +234,43 @@ def frames_of(
     places = None if source is None else source.places(dataset)
     if source is None or places is None:
         return replace(every, pointings=tuple(pointings_of(observation)))
-    recorded = every.pixels == "recorded"
-    details = [
-        FrameDetails(
-            source.paths[i].name,
-            source.headers[i],
-            source.first_pixels[i] if recorded else None,
-            source.star_offsets[i],
-        )
-        for i in places[chosen]
-    ]
     target, references = admit(source, places[chosen], library)
     if not target.any():
         raise NoValidPixelsError(
             f"{observation.name}: none of these frames can be used; the warnings say why"
         )
     usable = every.usable.copy()
-    usable[np.flatnonzero(usable)[~target]] = False
+    usable[chosen[~target]] = False
     every = every if target.all() else replace(every, data=every.data[target])
     used = part_of(observation, target)
+    details = [source.details[i] for i in places[chosen[target]]]
+    if every.pixels != "recorded":
+        details = [each._replace(first_pixel=None) for each in details]
+    pointings = tuple(pointings_of(used, details))
     return replace(
-        every,
-        observation=used,
-        usable=usable,
-        pointings=tuple(
-            pointings_of(used, [d for d, yes in zip(details, target, strict=True) if yes])
-        ),
-        references=references,
+        every, observation=used, usable=usable, pointings=pointings, references=references
     )
 
 
 def _gather(dataset: Any, imgs: NDArray[Any], settings: DiffrenderSettings) -> Frames:
     """Gather all frames, of whatever star; warns if the files are of no use."""
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
-    recorded: Recorded | None = None
     centers, pixels, noise = native_float64(dataset.centers), "as given", "ERR"
     header, unit, pixelscale = fits.Header(), settings.unit, settings.pixelscale
     lost = why_without_source(dataset)
     if source is not None:
         places = source.places(dataset)
-        header = source.headers[0 if places is None else places[0]]
+        header = source.details[0 if places is None else places[0]].header
         try:
-            recorded = recorded_frames(source, places, dataset, imgs)
+            data, valid, error, centers = recorded_frames(source, places, dataset, imgs)
+            pixels = "recorded"
         except NotRecordedError as reason:
             lost = str(reason)
         if unit is None:
             stated = header_text(header, "BUNIT", str(dataset.filenames[0]))
             unit = u.Unit(stated or "", parse_strict="silent")
         pixelscale = source.pixelscale if pixelscale is None else pixelscale
-    if recorded is not None:
-        data, valid, error, centers = recorded
-        pixels = "recorded"
-    else:
+    if pixels != "recorded":
         data = native_float64(imgs)
         valid, noise, error = np.isfinite(data), "estimated", _estimate(data)
     if lost is not None:

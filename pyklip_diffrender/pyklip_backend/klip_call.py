@@ -8,13 +8,12 @@ interface, and `high_pass_filter_imgs` by one that keeps the unfiltered frames f
 from __future__ import annotations
 
 import ctypes
-import dataclasses
 import io
 import logging
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +31,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.io.headers import fits_text, fits_unit, set_keyword
-from pyklip_diffrender.pyklip_backend.backend_settings import (
-    DiffrenderSettings,
-    starting_opd,
-)
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings, starting_opd
 from pyklip_diffrender.pyklip_backend.dataset_frames import (
     Frames,
     date_of_frames,
@@ -151,17 +147,6 @@ def place(
     return placed
 
 
-def _number_type(dtype: Any) -> np.dtype[Any]:
-    """Number type of pyKLIP: single precision unless the call says otherwise."""
-    return np.dtype(ctypes.c_float if dtype is None else dtype)
-
-
-def slices(frames: NDArray[np.float64], count: int, dtype: Any) -> NDArray[Any]:
-    """Repeat frames (n, ny, nx) in pyKLIP's number type, for numbasis: (count, n, ny, nx)."""
-    # Without a KL cut-off there is one result, but pyKLIP's later steps expect a slice per entry.
-    return np.repeat(frames.astype(_number_type(dtype))[np.newaxis], count, axis=0)
-
-
 def noise_cube(
     frames: NDArray[np.float64],
     center: NDArray[np.float64],
@@ -188,7 +173,7 @@ def aligned_before(
         align_and_scale(img, new_center=center, old_center=old)
         for img, old in zip(imgs, centers, strict=True)
     ]
-    return np.array([frames], dtype=_number_type(dtype))
+    return np.array([frames], dtype=dtype)
 
 
 # Checks that take a second, before minutes of fitting.
@@ -260,7 +245,7 @@ def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
         change = result.linear.response(light)[:, 0]
         for part in parts:
             star[part.pointing.frames] += part.change_in_frames(change)
-    return dataclasses.replace(before, star=star)
+    return replace(before, star=star)
 
 
 def _require_copy(record: ReductionRecord, frames: Frames) -> None:
@@ -391,13 +376,6 @@ class DatasetReduction:
     def _rdi(self) -> bool:
         return "RDI" in str(self.arguments["mode"]).upper()
 
-    def _reference_files(self) -> tuple[Path, ...]:
-        """Files of the reference frames that the call gives."""
-        library = self.arguments["psf_library"]
-        if library is None or not self._rdi:
-            return ()
-        return library_files(self.dataset, library)
-
     @property
     def _verbose(self) -> bool:
         return bool(self.arguments["verbose"])
@@ -422,11 +400,7 @@ class DatasetReduction:
         self._filter = apply
         return np.array([apply(frame) for frame in imgs])
 
-    def _in_place_of_klip(self, opd: OPDMap, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Do what the `klip_parallelized` of the patched module does."""
-        return self._klip_parallelized(opd, *args, **kwargs)
-
-    def _klip_parallelized(
+    def _in_place_of_klip(
         self,
         opd: OPDMap,
         imgs: NDArray[Any],
@@ -450,7 +424,9 @@ class DatasetReduction:
         )
         unfiltered = imgs if self._unfiltered is None else self._unfiltered
         placed = np.full(imgs.shape, np.nan)
-        library = self._reference_files()
+        library: tuple[Path, ...] = ()
+        if self._rdi and self.arguments["psf_library"] is not None:
+            library = library_files(self.dataset, self.arguments["psf_library"])
         if self._rdi and not library and hasattr(self.dataset, ATTRIBUTE):
             warnings.warn(
                 "the frames of psf_library are not used, because their files are not known: make "
@@ -466,11 +442,16 @@ class DatasetReduction:
             placed[i] = place(residual, old_center, center, annuli)
         placed[np.isnan(imgs)] = np.nan
 
-        count, dtype = len(np.atleast_1d(kw["numbasis"])), kw.get("dtype")
+        count = len(np.atleast_1d(kw["numbasis"]))
+        # Single precision unless the call says otherwise.
+        dtype = np.dtype(kw.get("dtype") or ctypes.c_float)
+        # Without a KL cut-off there is one result, but pyKLIP's later steps expect a slice for each
+        # entry of numbasis.
+        cube = np.repeat(placed.astype(dtype)[np.newaxis], count, axis=0)
         noise: NDArray[Any] = np.array([1.0])
         if kw.get("compute_noise_cube"):
             noise = noise_cube(placed, center, annuli, count, kw.get("numthreads"))
-        outputs: tuple[Any, ...] = (slices(placed, count, dtype), list(center), noise)
+        outputs: tuple[Any, ...] = (cube, list(center), noise)
         if kw.get("save_aligned"):
             outputs += (aligned_before(imgs, centers, center, dtype),)
         return outputs
@@ -486,20 +467,18 @@ class DatasetReduction:
             return
         self._tell("throughput of faint sources")
         (fit,) = record.subtraction.fits
+        if record.image == "cleaned":
+            throughput = record.images.sky.throughput()
+        else:
+            throughput = throughput_map(fit.result)
         median = write_throughput(
             stage / f"{prefix}-throughput.fits",
             self.dataset,
-            self._throughput(record, fit.result),
+            throughput,
             fit.result.frames[0].observation,
             is_turned=not self.arguments["skip_derot"],
         )
         set_keyword(cards, "DRTHRU", median)
-
-    def _throughput(self, record: ReductionRecord, result: Any) -> NDArray[np.float64]:
-        """Fraction of a faint source's peak that the products have, on the first frame's pixels."""
-        if record.image == "cleaned":
-            return record.images.sky.throughput()
-        return throughput_map(result)
 
     def _image(self, subtraction: Subtraction) -> str:
         """Return which image the products carry."""
@@ -591,7 +570,7 @@ class ForwardReduction(DatasetReduction):
         """Add what the fit says of the planet; the forward model says how much is left of it."""
         cards.extend(self._planet_cards)
 
-    def _in_place_of_klip(
+    def _in_place_of_klip(  # type: ignore[override]
         self,
         opd: OPDMap,
         imgs: NDArray[Any],
@@ -610,7 +589,7 @@ class ForwardReduction(DatasetReduction):
         deviation of the star. Without a planet, it and fmout are None. Noise is (b, n, ny, nx) if
         requested, else ``[1.]``.
         """
-        unturned, center, noise = self._klip_parallelized(
+        unturned, center, noise = super()._in_place_of_klip(
             opd, imgs, centers, parangs, wvs, np.arange(len(imgs)), IWA, **kw
         )
         cube = _turned(unturned[0], parangs, center, kw["flipx"])

@@ -30,8 +30,6 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd_map import OPDMap
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from pyklip_diffrender.detection.templates import Templates
     from pyklip_diffrender.imaging import SkyModel
     from pyklip_diffrender.optics.system import OpticalSystem
@@ -86,10 +84,8 @@ class ProductImages:
         rows, columns = (axis.ravel() for axis in np.indices(shape))
         peaks = []
         for start in range(0, len(rows), _IMAGES_AT_ONCE):
-            row, column = (
-                rows[start : start + _IMAGES_AT_ONCE],
-                columns[start : start + _IMAGES_AT_ONCE],
-            )
+            part = slice(start, start + _IMAGES_AT_ONCE)
+            row, column = rows[part], columns[part]
             images = templates.at_pixels(row, column)
             first = images[min(images)].double().numpy()
             peaks.append(first[np.arange(len(row)), row, column])
@@ -125,21 +121,14 @@ class ProductImages:
             shown = np.isfinite(pasted) & np.isfinite(frames)
             residuals[part.pointing.frames] = np.where(shown, pasted, frames)
 
-    def _added(self, added: Image) -> dict[int, Tensor]:
-        """Light in copies of the frames, (1, ny, nx) by frame of the fit."""
-        light = {}
-        for part in self.pointings:
-            image = torch.from_numpy(part.mean_light(added))
-            known = part.result.linear.frames[part.index].weight > 0
-            light[part.index] = torch.where(known, image, 0.0)[None]
-        return light
-
     def _cleaned(self, added: Image | None) -> Image:
         """Posterior mean of the sky, north up."""
         light = dict(self.sky.light())
         if added is not None:
-            for k, image in self._added(added).items():
-                light[k] = light[k] + image
+            for part in self.pointings:
+                image = torch.from_numpy(part.mean_light(added))
+                known = part.result.linear.frames[part.index].weight > 0
+                light[part.index] = light[part.index] + torch.where(known, image, 0.0)[None]
         rest = np.asarray(self.sky.estimate(light)[0])
         return rest if self._extended is None else rest + self._extended
 
@@ -162,13 +151,6 @@ SPACING = 2
 """Pixels between the positions at which the throughput is computed; between them it is
 interpolated."""
 
-_DENSE_PIXELS = 5
-"""Pixels about a companion of the fit within which every pixel is computed."""
-
-_INNER_PIXELS = 15
-"""Pixels about the star within which every pixel is computed: interpolation would err there by up
-to 15 %."""
-
 _PEAK_FWHM_LAMBDA_D = 0.5
 """FWHM in lambda/D of the Gaussian with which a source's peak is measured."""
 
@@ -176,7 +158,7 @@ _PLACES_AT_A_TIME = 256
 
 
 def throughput_map(
-    fit: Refinement, spacing: int = SPACING, inner: float = _INNER_PIXELS
+    fit: Refinement, spacing: int = SPACING, inner: float = 15.0
 ) -> NDArray[np.float64]:
     """Fraction (ny, nx) of a faint source's peak that is left, on the fit's first frame's pixels.
 
@@ -194,11 +176,12 @@ def throughput_map(
     every = np.moveaxis(np.indices((ny, nx)), 0, -1)
     filled = np.asarray(RegularGridInterpolator((rows, columns), coarse)(every))
     pixel = math.sqrt(math.prod(fit.model.detector.pixelscale))
-    # Interpolation errs where the throughput changes from pixel to pixel: near the star, and near
-    # companions, at whose places no light becomes star because they are part of the model.
+    # Interpolation errs where the throughput changes from pixel to pixel: near the star, by up to
+    # 15 %, and near companions, at whose places no light becomes star because they are part of the
+    # model.
     dense = np.hypot(*templates.grid.transpose(2, 0, 1)) <= inner * pixel
     for _, *offset in fit.companions:
-        dense |= np.hypot(*(templates.grid - offset).transpose(2, 0, 1)) <= _DENSE_PIXELS * pixel
+        dense |= np.hypot(*(templates.grid - offset).transpose(2, 0, 1)) <= 5 * pixel
     filled[dense] = _at(fit, templates, *np.nonzero(dense))
     return filled
 
@@ -381,6 +364,7 @@ def provenance(record: ReductionRecord) -> fits.Header:
     Where there are several fits, chi2 and status are the worst fit's, and HISTORY has all.
     """
     frames, subtraction, opd = record.frames, record.subtraction, record.opd
+    reduction = subtraction.reduction
     passband = frames.observation.filter
     header = fits.Header()
     values: dict[str, Any] = {
@@ -395,7 +379,8 @@ def provenance(record: ReductionRecord) -> fits.Header:
         "DRKEPT": subtraction.kept,
         "DRPATTRN": subtraction.pattern,
         "DRREFS": subtraction.references,
-        "DRREFUSE": _use_of_references(subtraction),
+        # Empty for other subtractors.
+        "DRREFUSE": "" if reduction is None else reduction.visit.in_words(),
         "DRPIXELS": frames.pixels,
         "DRFILLED": record.filled,
         "DRIMAGE": record.image,
@@ -430,11 +415,6 @@ def provenance(record: ReductionRecord) -> fits.Header:
     for line in _fitted(subtraction):
         header.add_history(f"diffrender: {line}")
     return header
-
-
-def _use_of_references(subtraction: Subtraction) -> str:
-    """Use of the frames of reference stars in words; empty for other subtractors."""
-    return "" if subtraction.reduction is None else subtraction.reduction.visit.in_words()
 
 
 def _fitted(subtraction: Subtraction) -> Iterator[str]:

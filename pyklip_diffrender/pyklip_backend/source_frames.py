@@ -9,6 +9,7 @@ orientation are a `Pointing`.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,8 +53,8 @@ class SourceFrames:
     Frames that spaceKLIP has aligned are back on the pixels of the detector.
     """
 
-    # One of each per frame: primary and SCI header merged.
-    headers: list[fits.Header]
+    # One for each frame.
+    details: list[FrameDetails]
     # (N, ny, nx), before resampling; NaN where the flags say NON_SCIENCE.
     data: NDArray[np.floating[Any]]
     # (N, ny, nx), standard deviations from ERR in the unit of `data`.
@@ -68,12 +69,6 @@ class SourceFrames:
     aligned_centers: NDArray[np.float64]
     # ``dataset.filenames`` after reading.
     filenames: tuple[str, ...]
-    # Detector column and row of the first pixel of every frame, where known.
-    first_pixels: list[tuple[int, int] | None]
-    # x, y of the star from the occulter as the file says, arcsec, where it does.
-    star_offsets: list[tuple[float, float] | None]
-    # The file of every frame.
-    paths: list[Path]
     files: dict[Path, FrameFile]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
@@ -83,7 +78,7 @@ class SourceFrames:
     @property
     def pixelscale(self) -> float:
         """Arcsec per pixel."""
-        return float(np.sqrt(self.headers[0]["PIXAR_A2"]))
+        return float(np.sqrt(self.details[0].header["PIXAR_A2"]))
 
     def places(self, dataset: Any) -> NDArray[np.intp] | None:
         """Return where the frames of a dataset are among these; None if one is not.
@@ -105,6 +100,7 @@ class SourceFrames:
 def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
     """Wrap `JWSTData.readdata` so that it also attaches a `SourceFrames` to the dataset."""
 
+    @functools.wraps(readdata)
     def readdata_and_source(self: Any, filepaths: Any) -> None:
         readdata(self, filepaths)
         try:
@@ -113,8 +109,6 @@ def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
             # The dataset itself is complete without the source frames.
             setattr(self, REASON, str(error))
 
-    readdata_and_source.__name__ = readdata.__name__
-    readdata_and_source.__doc__ = readdata.__doc__
     return readdata_and_source
 
 
@@ -140,16 +134,12 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
 
     paths = [filepaths] if isinstance(filepaths, str) else list(filepaths)
     files = [_File.read(Path(path).absolute(), dataset) for path in paths]
-    counts = [len(file.frames.data) for file in files]
     first = files[0]
     middle = (np.array(first.as_read.shape[::-1]) - 1) / 2.0
     shifted = align_and_scale(first.as_read, new_center=middle, old_center=first.center)
 
-    def repeated(values: Iterable[Any]) -> list[Any]:
-        return [value for value, n in zip(values, counts, strict=True) for _ in range(n)]
-
     source = SourceFrames(
-        headers=repeated(each.header for each in files),
+        details=[each.details for each in files for _ in each.centers],
         data=_joined([each.frames.data for each in files]),
         error=_joined([each.frames.error for each in files]),
         usable=_joined([each.frames.valid for each in files]),
@@ -157,9 +147,6 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
         aligned=np.array(dataset.input),
         aligned_centers=np.array(dataset.centers),
         filenames=tuple(str(name) for name in dataset.filenames),
-        first_pixels=repeated(each.frames.first_pixel for each in files),
-        star_offsets=repeated(each.frames.star_offset for each in files),
-        paths=repeated(each.file.path for each in files),
         files={each.file.path: each.file for each in files},
     )
     same_shape = source.data.shape == source.aligned.shape
@@ -179,11 +166,20 @@ def _is_close(one: NDArray[Any], other: NDArray[Any]) -> bool:
     return np.allclose(one, other, rtol=0.0, atol=_SHIFT_ROUNDING * scale, equal_nan=True)
 
 
+class FrameDetails(NamedTuple):
+    """Details of one frame, from its file, that an `Observation` of several does not hold."""
+
+    path: Path
+    header: fits.Header  # primary and SCI header merged
+    first_pixel: tuple[int, int] | None  # detector column and row, where known
+    star_offset: tuple[float, float] | None  # x, y from the occulter, arcsec, as the file says
+
+
 class _File(NamedTuple):
     """The frames of one file; see `SourceFrames`."""
 
     file: FrameFile
-    header: fits.Header
+    details: FrameDetails
     frames: Observation  # all integrations, as in `SourceFrames`
     centers: NDArray[np.float64]
     as_read: NDArray[np.floating[Any]]  # (ny, nx), the first one as pyKLIP reads it
@@ -224,19 +220,19 @@ class _File(NamedTuple):
                 for key, crpix in (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
             ]
             centers += frames.center - (np.array(stated, dtype=float) - 1)
-        return cls(file, header, frames, centers, as_read[0].copy(), center)
+        details = FrameDetails(path, header, frames.first_pixel, frames.star_offset)
+        return cls(file, details, frames, centers, as_read[0].copy(), center)
 
 
 def keeping_references(readpsflib: Callable[..., None]) -> Callable[..., None]:
     """Wrap `JWSTData.readpsflib` so that the dataset also knows the paths of the files."""
 
+    @functools.wraps(readpsflib)
     def readpsflib_and_paths(self: Any, psflib_filepaths: Any, *args: Any, **kw: Any) -> None:
         readpsflib(self, psflib_filepaths, *args, **kw)
         several = [psflib_filepaths] if isinstance(psflib_filepaths, str) else psflib_filepaths
         setattr(self, REFERENCES, tuple(str(Path(path).resolve()) for path in several))
 
-    readpsflib_and_paths.__name__ = readpsflib.__name__
-    readpsflib_and_paths.__doc__ = readpsflib.__doc__
     return readpsflib_and_paths
 
 
@@ -255,23 +251,15 @@ class NotRecordedError(Exception):
     """Raised where the recorded pixels are not the dataset's; the message gives the reason."""
 
 
-class Recorded(NamedTuple):
-    """Recorded pixels with what was added to the dataset since, (n, ny, nx), and their star."""
-
-    data: NDArray[np.float64]
-    valid: NDArray[np.bool_]
-    error: NDArray[np.float64]
-    centers: NDArray[np.float64]  # (n, 2), x, y
-
-
 def recorded_frames(
     source: SourceFrames,
     places: NDArray[np.intp] | None,
     dataset: Any,
     imgs: NDArray[Any],
-) -> Recorded:
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
     """Recorded pixels plus what was added to `imgs` (n, ny, nx) since reading.
 
+    Returns data, mask of valid pixels and errors, (n, ny, nx), and x, y of the star, (n, 2).
     Frame by frame, so that the changes of all frames are not in memory at once. `places` (n,) say
     where the frames are in `source`. Raises NotRecordedError if no recorded pixels correspond to
     the dataset's.
@@ -308,7 +296,7 @@ def recorded_frames(
         if masked.any():
             # A pixel masked by hand invalidates every recorded pixel that contributed to it.
             valid[i] &= np.nan_to_num(align_and_scale(masked.astype(float), **shift)) < 0.1
-    return Recorded(data, valid, error, source.centers[places] + moved)
+    return data, valid, error, source.centers[places] + moved
 
 
 def _require_same(
@@ -329,15 +317,6 @@ def _require_same(
 
 
 # Pointings: frames that show the star at one place and orientation, averaged for the fit.
-
-
-class FrameDetails(NamedTuple):
-    """Details of one frame, from its file, that an `Observation` of several does not hold."""
-
-    file: str
-    header: fits.Header
-    first_pixel: tuple[int, int] | None = None
-    star_offset: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,7 +363,7 @@ def pointings_of(
         return [Pointing(group, _at_one_place(observation, group)) for group in groups]
     files: dict[str, list[int]] = {}
     for k, each in enumerate(details):
-        files.setdefault(each.file, []).append(k)
+        files.setdefault(each.path.name, []).append(k)
     made = []
     for file, rows in files.items():
         inside = np.array(rows)
