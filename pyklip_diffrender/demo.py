@@ -103,11 +103,7 @@ def run_demo(
     planet = Planet(contrast, separation, 54.0)
     scene = Scene(planets=(planet,))
     model = nircam_coronagraph(
-        "F444W",
-        monochromatic=4.5e-6,
-        fov_pixels=size,
-        segment_gap=PAPER_SEGMENT_GAP,
-        device=device,
+        "F444W", monochromatic=4.5e-6, fov_pixels=size, segment_gap=PAPER_SEGMENT_GAP, device=device
     )
     measured = random_opd(seed)
     true_opd = measured.data + random_drift(seed + 1000, hours).data
@@ -174,8 +170,7 @@ def _compared(
         for name, image in images.items()
     ]  # fmt: skip
     table = Table(
-        rows=rows,
-        names=("star model", "annulus SNR", "planet throughput", "star error", "seconds"),
+        rows=rows, names=("star model", "annulus SNR", "planet throughput", "star error", "seconds")
     )
     for name, form in zip(table.colnames[1:], (".1f", ".2f", ".2f", ".1f"), strict=True):
         table[name].format = form

@@ -20,11 +20,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from pyklip_diffrender.detection import Detection
-from pyklip_diffrender.errors import (
-    DiffrenderError,
-    DiffrenderWarning,
-    IncompatibleSetupError,
-)
+from pyklip_diffrender.errors import DiffrenderError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.headers import file_name, fits_text, known_number

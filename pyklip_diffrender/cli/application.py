@@ -412,13 +412,7 @@ def application() -> None:
     """
 
 
-for _command in (
-    demo,
-    reduce_frames,
-    learn,
-    run_survey,
-    doctor,
-):
+for _command in (demo, reduce_frames, learn, run_survey, doctor):
     application.add_command(_command)
 
 

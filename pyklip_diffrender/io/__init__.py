@@ -5,13 +5,7 @@ from __future__ import annotations
 from pyklip_diffrender.io.files import open_fits, replacing, sha256, write_fits
 from pyklip_diffrender.io.headers import sensing_date
 from pyklip_diffrender.io.progress import ProgressBar, stage
-from pyklip_diffrender.io.units import (
-    ARCSEC,
-    native_float64,
-    require_finite,
-    to_metres,
-    to_unit,
-)
+from pyklip_diffrender.io.units import ARCSEC, native_float64, require_finite, to_metres, to_unit
 
 __all__ = [
     "ARCSEC",

@@ -267,11 +267,7 @@ class OutputFolder:
     """
 
     def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        names: Iterable[str],
-        *,
-        overwrite: bool,
+        self, folder: str | os.PathLike[str], names: Iterable[str], *, overwrite: bool
     ) -> None:
         self.asked = self.folder = Path(folder)
         if self.folder.exists() and not self.folder.is_dir():
@@ -398,10 +394,7 @@ def write_fits(hdus: fits.HDUList, path: str | os.PathLike[str]) -> None:
 
 def write_page(page: Path, html: str, data: Path, content: Mapping[str, Any]) -> None:
     """Write a page of HTML and its content as JSON, each in one step."""
-    for path, text in (
-        (page, html),
-        (data, json.dumps(content, indent=2, allow_nan=False) + "\n"),
-    ):
+    for path, text in ((page, html), (data, json.dumps(content, indent=2, allow_nan=False) + "\n")):
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
 

@@ -105,10 +105,7 @@ def admit(
 
 
 def _sequence(
-    source: SourceFrames,
-    frames: NDArray[np.intp],
-    paths: Sequence[Path],
-    library: Sequence[Path],
+    source: SourceFrames, frames: NDArray[np.intp], paths: Sequence[Path], library: Sequence[Path]
 ) -> ExposureSequence:
     """Sort the files of frames and of the library, opening none twice."""
     headers = [source.details[k].header for k in frames]
@@ -216,10 +213,7 @@ def require_frames(dataset: Any) -> None:
 
 
 def frames_of(
-    dataset: Any,
-    imgs: NDArray[Any],
-    settings: DiffrenderSettings,
-    library: Sequence[Path] = (),
+    dataset: Any, imgs: NDArray[Any], settings: DiffrenderSettings, library: Sequence[Path] = ()
 ) -> Frames:
     """Gather the target's frames with their errors, masks and metadata.
 

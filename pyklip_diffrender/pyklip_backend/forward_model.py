@@ -104,12 +104,7 @@ def planet_in_frames(
         parts = [pointing for pointing in pointings if pointing.result is result]
         sources = [
             _PlanetImage.of(
-                fm_class,
-                part,
-                float(angles[part.pointing.frames[0]]),
-                wavelength,
-                flipx,
-                filtered,
+                fm_class, part, float(angles[part.pointing.frames[0]]), wavelength, flipx, filtered
             )
             for part in parts
         ]

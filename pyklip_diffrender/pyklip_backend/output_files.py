@@ -250,12 +250,7 @@ def on_product(
 
 
 def write_throughput(
-    path: Path,
-    dataset: Any,
-    image: NDArray[np.float64],
-    frame: Observation,
-    *,
-    is_turned: bool,
+    path: Path, dataset: Any, image: NDArray[np.float64], frame: Observation, *, is_turned: bool
 ) -> float:
     """Write a map of the throughput on the products' pixels, and return the fitted pixels' median.
 

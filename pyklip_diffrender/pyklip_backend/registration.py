@@ -334,11 +334,7 @@ def unregister() -> None:
 
 @contextlib.contextmanager
 def backend(
-    *,
-    opd: OPDLike | None = None,
-    model: Any = None,
-    force: bool = True,
-    **options: Any,
+    *, opd: OPDLike | None = None, model: Any = None, force: bool = True, **options: Any
 ) -> Iterator[None]:
     """Use this backend within a block, without changing the code that is called there.
 

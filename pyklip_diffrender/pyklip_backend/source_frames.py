@@ -252,10 +252,7 @@ class NotRecordedError(Exception):
 
 
 def recorded_frames(
-    source: SourceFrames,
-    places: NDArray[np.intp] | None,
-    dataset: Any,
-    imgs: NDArray[Any],
+    source: SourceFrames, places: NDArray[np.intp] | None, dataset: Any, imgs: NDArray[Any]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
     """Recorded pixels plus what was added to `imgs` (n, ny, nx) since reading.
 

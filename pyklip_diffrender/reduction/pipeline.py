@@ -225,10 +225,7 @@ def prepare(
     settings = quick_settings(cut.science[0]) if is_quick else options.settings
     science, references = (
         tuple(map(without_blurred_edges, wholes, cuts))
-        for wholes, cuts in (
-            (sequence.science, cut.science),
-            (sequence.references, cut.references),
-        )
+        for wholes, cuts in ((sequence.science, cut.science), (sequence.references, cut.references))
     )
     cut = replace(cut, science=science, references=references)
     given = options.pattern
@@ -300,10 +297,7 @@ class Preparation:
     keep: Callable[[ReductionResult], object] | None = None
 
     def run(
-        self,
-        *,
-        progress: bool = False,
-        keep: Callable[[ReductionResult], object] | None = None,
+        self, *, progress: bool = False, keep: Callable[[ReductionResult], object] | None = None
     ) -> ReductionResult:
         """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
 

@@ -215,11 +215,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def write_products(
-    reduction: ReductionResult,
-    folder: Path,
-    *,
-    fit: bool = True,
-    derivatives: bool = False,
+    reduction: ReductionResult, folder: Path, *, fit: bool = True, derivatives: bool = False
 ) -> list[Path]:
     """Write the products of a reduction to a folder without any, and return their paths.
 
@@ -259,11 +255,7 @@ class ProductFolder(OutputFolder):
     """
 
     def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        *,
-        derivatives: bool = False,
-        overwrite: bool = False,
+        self, folder: str | os.PathLike[str], *, derivatives: bool = False, overwrite: bool = False
     ) -> None:
         super().__init__(folder, PRODUCTS, overwrite=overwrite)
         self._derivatives = derivatives

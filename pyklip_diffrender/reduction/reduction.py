@@ -190,11 +190,7 @@ class Reduction(ReductionResult):
         return result
 
     def write(
-        self,
-        folder: str | os.PathLike[str],
-        *,
-        overwrite: bool = False,
-        derivatives: bool = False,
+        self, folder: str | os.PathLike[str], *, overwrite: bool = False, derivatives: bool = False
     ) -> list[Path]:
         """Write maps, tables, the fit, the detector pattern, a figure and a report.
 

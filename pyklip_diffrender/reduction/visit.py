@@ -45,13 +45,7 @@ from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import counted, stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
-from pyklip_diffrender.refinement import (
-    FitSettings,
-    FrameFit,
-    Refinement,
-    align_frame,
-    join_frames,
-)
+from pyklip_diffrender.refinement import FitSettings, FrameFit, Refinement, align_frame, join_frames
 from pyklip_diffrender.scene.detector_pattern import DetectorPattern
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
