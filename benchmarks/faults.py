@@ -21,13 +21,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from benchmarks import mutations
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.surveys import jobs
-from pyklip_diffrender.surveys.driver import run_survey
+from pyklip_diffrender.surveys import driver, jobs
 from pyklip_diffrender.surveys.jobs import Job
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -88,11 +86,9 @@ WORK: dict[str, Callable[[Job, Path], dict[str, Any]]] = {
 
 def run_client(config: str, output: str, work: str, scheduler: str | None) -> int:
     """Run a survey as the command line does, without the page, whose imports take longer."""
-    page = ModuleType("pyklip_diffrender.surveys.survey_page")
-    page.page = lambda *_: "no page"  # type: ignore[attr-defined]
-    sys.modules[page.__name__] = page
+    driver.page = lambda *_: "no page"  # type: ignore[assignment]
     try:
-        run_survey(config, output, WORK[work], scheduler)
+        driver.run_survey(config, output, WORK[work], scheduler)
     except DiffrenderError as error:
         print(error, file=sys.stderr)
         return 1

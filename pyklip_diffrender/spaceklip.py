@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.errors import DiffrenderError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
-from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.io.files import write_fits, write_table
 from pyklip_diffrender.io.headers import file_name, fits_text, known_number
 from pyklip_diffrender.options import SPECTRA
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
@@ -36,9 +36,6 @@ from pyklip_diffrender.scene.sequence import ExposureSequence
 _log = logging.getLogger(__name__)
 
 # Candidates in the form of spaceKLIP's table of sources.
-
-_OTHER_FLUXES = ("FLUX_SI", "FLUX_SI_ERR", "FLUX_SI_ALT", "FLUX_SI_ALT_ERR")
-_MAGNITUDES = ("APPMAG", "APPMAG_ERR", "MSTAR", "MSTAR_ERR")
 
 
 def source_table(detection: Detection, product: Path) -> Table:
@@ -64,10 +61,10 @@ def source_table(detection: Detection, product: Path) -> Table:
         **with_error("RA", "delta_ra"),
         **with_error("DEC", "delta_dec"),
         **with_error("FLUX_JY", "flux_density"),
-        **dict.fromkeys(_OTHER_FLUXES, unknown),
+        **dict.fromkeys(("FLUX_SI", "FLUX_SI_ERR", "FLUX_SI_ALT", "FLUX_SI_ALT_ERR"), unknown),
         **with_error("CON", "contrast"),
         **with_error("DELMAG", "delta_mag"),
-        **dict.fromkeys(_MAGNITUDES, unknown),
+        **dict.fromkeys(("APPMAG", "APPMAG_ERR", "MSTAR", "MSTAR_ERR"), unknown),
         "SNR": column("snr"),
         "LN(Z/Z0)": unknown,
         "TP_CORONMSK": unknown,
@@ -458,10 +455,8 @@ def _reduced(
     write_contrast(product, detection)
     detection.write(folder / prefix, overwrite=True)
     detection.fit.write(folder / prefix / "fit.fits", overwrite=True)
-    source_table(detection, product).write(
-        folder / f"{prefix}-results.ecsv", format="ascii.ecsv", overwrite=True
-    )
-    sequence.table.write(folder / f"{prefix}-frames.ecsv", format="ascii.ecsv", overwrite=True)
+    write_table(source_table(detection, product), folder / f"{prefix}-results.ecsv")
+    write_table(sequence.table, folder / f"{prefix}-frames.ecsv")
     write_database(folder / f"{key}.dat", table)
     write_mask(folder / f"{key}_psfmask.fits", table)
     return product, detection

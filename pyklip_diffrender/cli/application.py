@@ -244,8 +244,6 @@ def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Pa
 
 # The command `pyklip-diffrender learn`.
 
-_COLUMNS = ("star", "filter", "mask", "flat", "frames", "chi2_alone", "chi2_with_others", "shown")
-
 
 @click.command(
     "learn",
@@ -333,9 +331,11 @@ def learn(
     )
     (path,) = products.replace(lambda folder: [library.write(folder / output.name)])
     table = library.validation
-    for name in ("chi2_alone", "chi2_with_others", "shown"):
+    numbers = ["chi2_alone", "chi2_with_others", "shown"]
+    for name in numbers:
         table[name].info.format = ".2f"
-    click.echo("\n".join(table[list(_COLUMNS)].pformat(max_lines=-1, max_width=-1)))
+    shown = table[["star", "filter", "mask", "flat", "frames", *numbers]]
+    click.echo("\n".join(shown.pformat(max_lines=-1, max_width=-1)))
     if len(library.stars) < 2:
         click.echo("only one star: nothing tests its pattern, and it is not used for that star")
     click.echo(f"wrote {path}: {len(library.patterns)} frames of {', '.join(library.stars)}")

@@ -29,7 +29,6 @@ from pyklip_diffrender.wavefront.opd_map import OPDMap
 if TYPE_CHECKING:
     from pyklip_diffrender.detection import Detection
     from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.pattern import PatternRequest
     from pyklip_diffrender.reduction.pipeline import ReductionResult
     from pyklip_diffrender.refinement import FrameFit, Refinement
 
@@ -340,32 +339,23 @@ def _give_back(
 def _options(
     settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
 ) -> ReduceOptions:
-    """Options of the reduction; settings that are None have the defaults of `reduce`."""
+    """Options of the reduction; settings that are None have the defaults of `reduce`.
+
+    The pattern is by default "auto" for real NIRCam frames and "off" for others. Raises
+    IncompatibleSetupError if "references" is asked for without any.
+    """
     from pyklip_diffrender.reduction.remarks import MAX_CHI2
 
-    pattern = _requested_pattern(settings, observation, references)
-    return ReduceOptions(**{"max_chi2": MAX_CHI2, **settings.given, "pattern": pattern})
-
-
-def _requested_pattern(
-    settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
-) -> PatternRequest:
-    """The pattern that is asked for; "auto" for real NIRCam frames and "off" for others by default.
-
-    Raises IncompatibleSetupError if "references" is asked for without any.
-    """
-    from pyklip_diffrender.pattern import as_request
-
-    requested = settings.pattern
-    if requested is None:
-        return "auto" if observation.is_nircam else "off"
-    if requested == "references" and not references:
+    pattern = settings.pattern
+    if pattern is None:
+        pattern = "auto" if observation.is_nircam else "off"
+    elif pattern == "references" and not references:
         raise IncompatibleSetupError(
             "pattern='references' needs frames of reference stars: give them to JWSTData as "
             "psflib_filepaths after register(), and RDI in the mode and psf_library= to "
             "klip_dataset"
         )
-    return as_request(requested)
+    return ReduceOptions(**{"max_chi2": MAX_CHI2, **settings.given, "pattern": pattern})
 
 
 def model_of(

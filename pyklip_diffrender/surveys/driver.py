@@ -26,8 +26,7 @@ from pyklip_diffrender.surveys.jobs import (
     rename_to_jobs,
     staged,
 )
-from pyklip_diffrender.surveys.stars import StarSearch, search_stars
-from pyklip_diffrender.surveys.survey_page import page, row, table_of
+from pyklip_diffrender.surveys.results import StarSearch, page, row, search_stars, table_of
 
 _log = logging.getLogger(__name__)
 
