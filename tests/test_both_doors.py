@@ -30,7 +30,7 @@ from pyklip_diffrender.scene import frame_file
 from pyklip_diffrender.scene.aligned_frames import shift_frames
 from pyklip_diffrender.scene.observation import Observation, Window
 from pyklip_diffrender.scene.simulation import model_for
-from pyklip_diffrender.surveys import execution, jobs
+from pyklip_diffrender.surveys import driver, jobs
 from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = pytest.mark.usefixtures("offline")
@@ -283,7 +283,7 @@ def test_files_are_opened_and_judged_as_often_as_needed(door, light, tmp_path, c
     if door is through_a_survey:
         # It also makes sure that files do not change between plan and job.
         monkeypatch.setattr(jobs, "sha256", lambda path: str(path))
-        monkeypatch.setattr(execution, "sha256", lambda path: str(path))
+        monkeypatch.setattr(driver, "sha256", lambda path: str(path))
     opened = Counter()
     open_path, open_fits = Path.open, fits.open
 

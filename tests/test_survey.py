@@ -22,7 +22,7 @@ from benchmarks.calints_files import SIDE, calints
 from benchmarks.synthetic_searches import searched, write_searched
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
-from pyklip_diffrender.surveys import execution
+from pyklip_diffrender.surveys import driver
 from pyklip_diffrender.surveys import jobs as folders
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey
@@ -394,7 +394,7 @@ def test_frames_that_change_on_the_way_are_noticed(tmp_path):
 @pytest.mark.parametrize("what", ["file", "version", "output"])
 def test_a_worker_that_sees_something_else_says_so(tmp_path, what):
     (job,) = planned(inputs(tmp_path / "data", 1))
-    jobs = folders.prepare(tmp_path / "out")
+    jobs = folders.folder_for_jobs(tmp_path / "out")
     words = {"file": "does not see this file", "version": "99.0", "output": "see this folder"}[what]
     if what == "file":
         shutil.rmtree(tmp_path / "data")
@@ -402,7 +402,7 @@ def test_a_worker_that_sees_something_else_says_so(tmp_path, what):
         job = replace(job, version="99.0")
     else:
         shutil.rmtree(jobs)
-    record = execution.run_job(job, jobs, stub)
+    record = driver.run_job(job, jobs, stub)
     assert record["status"] == "failed"
     assert words in record["message"]
     # A worker must not make the folder on a disk of its own.
@@ -596,7 +596,7 @@ def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, m
 @pytest.mark.parametrize("north", [0.0, 30.0, 265.0])
 def test_injected_planets_are_at_their_position_angle_on_the_sky(north):
     injection = folders.Injection(1e-5, 0.8, 70.0)
-    x, y = execution._planet(injection, north).offset
+    x, y = driver._planet(injection, north).offset
     # The +y axis has the position angle `north`, and +x is 90 degrees clockwise of it on the sky:
     # west where north is up.
     up = np.deg2rad(north)

@@ -232,7 +232,7 @@ _log = logging.getLogger(__name__)
 Record = dict[str, Any]
 
 
-def prepare(output: Path) -> Path:
+def folder_for_jobs(output: Path) -> Path:
     """Make the folder of the jobs; raises IncompatibleSetupError if it cannot be written to."""
     jobs = output / "jobs"
     try:
