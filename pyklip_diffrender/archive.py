@@ -27,13 +27,13 @@ _SIZE_NOT_STATED = -1
 def _mast() -> Any:
     """The observations of MAST in astroquery; ArchiveError where that is not installed."""
     try:
-        from astroquery.mast import Observations
+        from astroquery import mast
     except ImportError as error:
         raise ArchiveError(
             "files from the archive need astroquery, which is not installed: "
             "python -m pip install astroquery"
         ) from error
-    return Observations
+    return mast.Observations
 
 
 def cache_folder() -> Path:
