@@ -33,7 +33,7 @@ _spec.loader.exec_module(sys.modules["benchmarks"])
 
 # A deadline measures how busy the machine is; derandomised, a failure is there again tomorrow.
 settings.register_profile("quick", deadline=None, derandomize=True, max_examples=8)
-settings.register_profile("full", settings.get_profile("quick"), max_examples=60)
+settings.register_profile("full", settings.get_profile("quick"), max_examples=20)
 
 
 def pytest_addoption(parser):

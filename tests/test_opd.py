@@ -221,6 +221,10 @@ def test_a_model_refuses_what_it_cannot_resample(tmp_path):
             model(np.zeros(shape))
     with pytest.raises(TypeError, match=r"read_opd\(path\)"):
         model(tmp_path / "map.fits")
+    with pytest.raises(UnitError, match="'s'"):
+        model(OPD * u.s)
+    with pytest.raises(UnitError, match="arcsec"):
+        model(OPD, star_offset=[1.0, 2.0] * u.m)
 
 
 def test_random_drift_grows_in_proportion_to_time():

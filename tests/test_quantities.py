@@ -139,9 +139,7 @@ def test_another_dimension_is_refused_by_name(name):
     numbers = {key: number for key, (_, number) in arguments.items()}
     for key, (value, _) in arguments.items():
         wrong = 1 * u.K if key != "source" else 1 * u.m
-        if key == "maps":
-            wrong = [OPD * u.K, OPD * u.K]
-        elif isinstance(value, dict):
+        if isinstance(value, dict):
             wrong = dict.fromkeys(value, wrong)
         elif isinstance(value, tuple):
             wrong = (value[0], value[0])

@@ -441,7 +441,8 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder):
 
 
 @pytest.mark.slow
-def test_a_header_cannot_write_into_the_page(tmp_path):
+def test_a_header_cannot_write_into_the_page(tmp_path, monkeypatch):
+    monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"\x89PNG")
     result = replace(shown()["Reduction"], pattern=None, failed=((HOSTILE, HOSTILE),))
     html, data = reported(result, tmp_path, [tmp_path / HOSTILE.replace("/", "")])
     text = html.read_text(encoding="utf-8")

@@ -95,30 +95,6 @@ def test_the_sky_is_where_the_frames_own_wcs_has_it(tmp_path, pixels):
     assert (away + 180) % 360 - 180 == pytest.approx(0, abs=0.2)
 
 
-def test_a_planet_in_an_image_is_on_the_side_of_the_sky_where_the_wcs_has_it():
-    """From the model's own pixels: `Planet.offset` and the table have the same x and y."""
-    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=33)
-    planet = dr.Planet(1.0, 0.8, 35.0)
-    with torch.no_grad():
-        image = model(None, planet.offset).numpy()
-    row, column = np.unravel_index(image.argmax(), image.shape)
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.crpix = ["RA---TAN", "DEC--TAN"], [17.0, 17.0]
-    wcs.wcs.crval = [30.0, -40.0]
-    # A frame whose +y axis is at position angle 50 degrees, east counter-clockwise of north.
-    sine, cosine = np.sin(np.deg2rad(50.0)), np.cos(np.deg2rad(50.0))
-    wcs.wcs.cd = np.array([[-cosine, sine], [sine, cosine]]) * model.detector.pixelscale[0] / 3600
-    star, place = wcs.pixel_to_world(16, 16), wcs.pixel_to_world(column, row)
-    there = candidates([list(planet.offset)], [1.0])
-    known = candidate_table(there, ErrorFactor.constant(1.0), np.zeros((2, 1)), Sky(north=50.0))
-    row, (east, north) = known[0], star.spherical_offsets_to(place)
-    assert row["position_angle"].to_value("deg") == pytest.approx(85.0)
-    assert row["frame_angle"].to_value("deg") == pytest.approx(35.0)
-    assert star.position_angle(place).deg == pytest.approx(85.0, abs=4)
-    assert row["delta_ra"].to_value("arcsec") == pytest.approx(east.arcsec, abs=0.05)
-    assert row["delta_dec"].to_value("arcsec") == pytest.approx(north.arcsec, abs=0.05)
-
-
 def test_without_a_roll_angle_nothing_is_said_about_the_sky(tmp_path):
     assert observation(tmp_path, ROLL_REF=None).position_angles is None
     blind = table(Sky(mjd=59855.5))

@@ -616,7 +616,8 @@ def planets_in(frames, places, contrast):
 
 
 @pytest.mark.slow
-def test_planets_beside_a_ring_are_found_at_twice_the_limits():
+def test_planets_are_found_beside_a_ring_and_not_next_to_it():
+    """At twice the limits; one next to the ring counts as its light and has no limit."""
     _, disk = fitted()
     alone = dr.detect(disk.fit, without_limits=disk.hides_points)
     assert len(alone.candidates) == 0
@@ -624,9 +625,12 @@ def test_planets_beside_a_ring_are_found_at_twice_the_limits():
     limit = float(np.interp(1.05, curve["separation"].value, curve["contrast"]))
     # Much of the ring's light would be noise without its own sources.
     assert limit < 3e-7
-    frames, _ = rolls(BRIGHTNESS)
     # From 1.0 to 1.15 arcsec from the star, 0.4 from the ring or more.
-    places = [(0.6, -0.9), (-0.8, -0.6), (0.3, 1.1)]
+    places, next_to = [(0.6, -0.9), (-0.8, -0.6), (0.3, 1.1)], (1.0, -0.35)
+    nearest = np.linalg.norm(disk.grid - next_to, axis=-1).argmin()
+    assert disk.hides_points.flat[nearest]
+    assert 0.15 < disk.hides_points.mean() < 0.35
+    frames = planets_in(rolls(BRIGHTNESS)[0], [next_to], 1e-6)
     again = with_disk(planets_in(frames, places, 2 * limit))
     found = dr.detect(again.fit, without_limits=again.hides_points).candidates
     there = np.stack([found["x"].value, found["y"].value], axis=-1)
@@ -634,6 +638,11 @@ def test_planets_beside_a_ring_are_found_at_twice_the_limits():
     assert sorted(away.argmin(axis=1)) == [0, 1, 2]
     assert away.min(axis=0) == pytest.approx(0, abs=0.05)
     assert np.asarray(found["contrast"]) == pytest.approx(2 * limit, rel=0.25)
+    light = [
+        each.contrasts[np.linalg.norm(each.offsets - next_to, axis=-1) < 0.15].sum()
+        for each in (disk, again)
+    ]
+    assert light[1] - light[0] == pytest.approx(1e-6, rel=0.3)
 
 
 @pytest.mark.slow
@@ -643,22 +652,6 @@ def test_clumps_of_faint_rings_and_of_single_rolls_are_no_planets(brightness, co
     disk = with_disk(frames[:count])
     assert len(dr.detect(disk.fit).candidates) == 0
     assert amount(disk.light[0], rings[0]) == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.slow
-def test_a_planet_next_to_a_ring_counts_as_its_light_and_has_no_limit():
-    _, disk = fitted()
-    place = (1.0, -0.35)
-    nearest = np.linalg.norm(disk.grid - place, axis=-1).argmin()
-    assert disk.hides_points.flat[nearest]
-    assert 0.15 < disk.hides_points.mean() < 0.35
-    again = with_disk(planets_in(rolls(BRIGHTNESS)[0], [place], 1e-6))
-    assert len(dr.detect(again.fit).candidates) == 0
-    light = [
-        each.contrasts[np.linalg.norm(each.offsets - place, axis=-1) < 0.15].sum()
-        for each in (disk, again)
-    ]
-    assert light[1] - light[0] == pytest.approx(1e-6, rel=0.3)
 
 
 @pytest.mark.slow
