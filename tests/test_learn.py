@@ -319,6 +319,17 @@ def rolls(cards, **changes):
     return [frame("TARGET", cards, seed=k, **changes) for k in (1, 2)]
 
 
+def fitting(made):
+    """Fits with the chosen pattern, which are listed by its label and whether they are repeated."""
+
+    def fit(choice, again):
+        made.append((choice.label, again))
+        pattern = choice.pattern
+        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, pattern=pattern)
+
+    return fit
+
+
 @pytest.mark.parametrize(
     ("request_", "cards", "fitted", "label", "used"),
     [
@@ -372,18 +383,11 @@ def test_a_known_pattern_takes_the_place_of_most_of_the_models_error():
 )
 def test_a_library_of_another_flat_field_is_replaced(cards, shown, references, labels):
     """The fit is repeated with what there is besides the library."""
-    fitted = []
-
-    def fit(choice, again):
-        assert again == bool(fitted)
-        fitted.append(choice.label)
-        pattern = choice.pattern
-        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, pattern=pattern)
-
+    made = []
     others = [frame("REF", cards, shown=shown, seed=3 + k) for k in range(references)]
     given = rolls(cards, shown=shown), others, model(), COARSE
-    choice, last = dr.pattern.fit_with_pattern(*given, fit, settings=ALIGNED)
-    assert fitted == labels
+    choice, last = dr.pattern.fit_with_pattern(*given, fitting(made), settings=ALIGNED)
+    assert made == list(zip(labels, (False, True), strict=False))
     assert last.pattern is choice.pattern
 
 
@@ -492,18 +496,13 @@ def test_what_a_pattern_does_not_say_is_a_remark(tmp_path, caplog):
 @pytest.mark.parametrize(("cards", "fitted"), [(SAME_FLAT, 1), (LIBRARY, 1), (OTHER_FLAT, 0)])
 def test_a_pattern_that_is_given_and_not_seen_is_refused(cards, fitted):
     """Before the fit where the frames name another flat field than the pattern."""
-    count = []
-
-    def fit(choice, again):
-        count.append(again)
-        pattern = choice.pattern
-        return dr.refine(model(), choice.science, COARSE, settings=ALIGNED, pattern=pattern)
-
+    made = []
+    fit = fitting(made)
     arguments = {"settings": ALIGNED, "pattern": given()}
     message = "shows less than half of the pattern 'HIP17695, G-7-34'. .*_0465.fits"
     with pytest.raises(errors.IncompatibleSetupError, match=message):
         dr.pattern.fit_with_pattern(rolls(cards, shown=0.0), (), model(), COARSE, fit, **arguments)
-    assert len(count) == fitted
+    assert len(made) == fitted
     shown = rolls(cards)
     choice, _ = dr.pattern.fit_with_pattern(shown, (), model(), COARSE, fit, **arguments)
     assert choice.pattern is given()
@@ -512,7 +511,7 @@ def test_a_pattern_that_is_given_and_not_seen_is_refused(cards, fitted):
         mixed = [rolls(SAME_FLAT)[0], rolls(cards, shown=0.0)[1]]
         with pytest.raises(errors.IncompatibleSetupError, match=message):
             dr.pattern.fit_with_pattern(mixed, (), model(), COARSE, fit, **arguments)
-        assert len(count) == 1
+        assert len(made) == 1
 
 
 def test_frames_are_moved_onto_the_pixels_of_a_pattern_that_is_given():

@@ -57,9 +57,10 @@ CASES = {
     "case", ["on axis", *(pytest.param(each, marks=pytest.mark.slow) for each in list(CASES)[1:])]
 )
 def test_images_agree_to_rounding(stpsf_path, case):
-    """Much closer than required: both sample the same points."""
+    """Much closer than required: both sample the same points, of however fine a transform."""
     options, changes = CASES[case]
-    instrument, call = nircam(stpsf_path, **options), {**CALL, **changes}
+    instrument = nircam(stpsf_path, **options)
+    call = {**CALL, "fft_oversample": 2, **changes}
     truth = instrument.calc_psf(**call)
     model = from_webbpsf(instrument, **call)
     psf = model.calc_psf()
@@ -123,35 +124,31 @@ def mask_and_place(aperture):
 @pytest.mark.parametrize(
     ("aperture", "band", "wavelength"),
     [
-        ("NRCA5_FULL_MASK335R", "F444W", 4.5e-6), ("NRCA2_FULL_MASK210R", "F200W", 2.0e-6),
-        ("NRCA4_FULL_MASKSWB_F200W", "F200W", 2.0e-6),
+        ("NRCA5_FULL_MASK335R", "F444W", 4.5e-6), ("NRCA4_FULL_MASKSWB_F200W", "F200W", 2.0e-6),
         ("NRCA5_FULL_MASKLWB_F444W", "F444W", 4.5e-6),
     ],
 )  # fmt: skip
 def test_the_embedded_occulter_is_that_of_stpsf(stpsf_path, aperture, band, wavelength):
-    """On and off the axis, everything else being stpsf's, cells of 1/4 lambda/D in both."""
-    # On the axis the image is 1e3 to 1e5 times fainter, and errors are stated of that. The ends of
-    # a bar are sharp, and stpsf's FFT has its points half a cell elsewhere. A bar that was
-    # mirrored, or 0.1 arcsec away, would change more than a percent off the axis.
+    """For a star off the axis, everything else being stpsf's, cells of 1/4 lambda/D in both."""
+    # The ends of a bar are sharp, and stpsf's FFT has its points half a cell elsewhere. A bar that
+    # was mirrored, or 0.1 arcsec away, would change more than a percent.
     mask, place = mask_and_place(aperture)
-    bar = mask.endswith("WB")
     call = {**FULL, "fft_oversample": 4, "fov_pixels": 60, "monochromatic": wavelength}
     embedded = nircam_coronagraph(
         band, image_mask=mask, bar_place=place, npix=NPIX, occulter_sampling=4,
         route="planes",
     )  # fmt: skip
-    for star, limit, limit_of_bars in (((0.0, 0.0), 2e-7, 1e-2), ((0.35, -0.2), 1e-8, 1e-3)):
-        options = {**BARE, "source_offset_x": star[0], "source_offset_y": star[1]}
-        instrument = nircam(stpsf_path, band=band, image_mask=mask, aperture=aperture, **options)
-        truth = instrument.calc_psf(**call)[1].data
-        model = from_webbpsf(instrument, **call)
-        assert embedded.detector.pixelscale == pytest.approx(model.detector.pixelscale, abs=1e-9)
-        planes = [embedded.between[0] if plane.name == mask else plane for plane in model.between]
-        assert embedded.between[0] in planes
-        system = OpticalSystem(model.entrance, planes, model.detector, model.bandpass)
-        image = system().numpy()  # The star is where stpsf has it, as part of the entrance.
-        allowed = limit_of_bars if bar else limit
-        assert np.abs(image - truth).max() <= allowed * truth.max()
+    options = {**BARE, "source_offset_x": 0.35, "source_offset_y": -0.2}
+    instrument = nircam(stpsf_path, band=band, image_mask=mask, aperture=aperture, **options)
+    truth = instrument.calc_psf(**call)[1].data
+    model = from_webbpsf(instrument, **call)
+    assert embedded.detector.pixelscale == pytest.approx(model.detector.pixelscale, abs=1e-9)
+    planes = [embedded.between[0] if plane.name == mask else plane for plane in model.between]
+    assert embedded.between[0] in planes
+    system = OpticalSystem(model.entrance, planes, model.detector, model.bandpass)
+    image = system().numpy()  # The star is where stpsf has it, as part of the entrance.
+    limit = 1e-3 if mask.endswith("WB") else 1e-8
+    assert np.abs(image - truth).max() <= limit * truth.max()
 
 
 @pytest.mark.parametrize(
@@ -176,23 +173,8 @@ def test_the_embedded_transmission_is_that_of_stpsf(stpsf_path, band, aperture):
     assert np.abs(mine - truth).max() <= (1e-14 if ours.stop == "MASKRND" else 1e-8)
 
 
-# Changes that a test with such limits must notice.
-WRONG = (
-    {"flip_si_wfe": False},
-    {"chromatic_reference": None},  # The wedge's tilt is then at another wavelength.
-    {"image_mask": "MASK430R", "pixelscale": 0.062424185},
-    {"defaults": {"lyot_shift": (0.0, 0.002)}},
-)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("case", EMBEDDED)
 def test_the_embedded_coronagraph_is_that_of_the_official_files(official, case):
     """What is left: the outlines of pupil (0.2 %) and stop (0.1 %), and poppy's Zernike circle."""
     assert max(differences(official, case, {})) < EMBEDDED[case][-1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", WRONG, ids=str)
-def test_what_is_wrong_in_the_embedded_coronagraph_is_seen(official, wrong):
-    assert max(differences(official, "MASK335R", wrong)) > 0.03

@@ -72,7 +72,7 @@ def calints(folder, filter="F210M"):
 @pytest.mark.slow
 def test_a_planet_is_where_it_is_and_nothing_else(tmp_path):
     """A map that is 5 nm rms off, a star and a stop off their places, and no detector pattern."""
-    settings = FitSettings.nircam("F210M", cycles=(7.0,), max_iterations=10)
+    settings = FitSettings.nircam("F210M", cycles=(5.0,), max_iterations=8)
     frame, opd = calints(tmp_path), random_opd(1, npix=256)
     result = reduce([frame], opd, size=SIZE, settings=settings)
     assert result.pattern is None
@@ -126,12 +126,10 @@ def test_frames_of_module_b_are_refused(tmp_path):
 def test_what_is_not_modelled_is_refused(tmp_path):
     path = calints(tmp_path)
     (frame,) = ExposureSequence.from_files([path]).science
-    frame.header["DETECTOR"] = "NRCA4"
-    with pytest.raises(IncompatibleSetupError, match=r"detector NRCA4, expected NRCA2"):
-        model_for(frame, SIZE)
-    frame.header["DETECTOR"] = "NRCB1"
-    with pytest.raises(IncompatibleSetupError, match=r"detector NRCB1, expected NRCA2"):
-        model_for(frame, SIZE)
+    for detector in ("NRCA4", "NRCB1"):
+        frame.header["DETECTOR"] = detector
+        with pytest.raises(IncompatibleSetupError, match=f"{detector}, expected NRCA2"):
+            model_for(frame, SIZE)
     fits.setval(path, "INSTRUME", value="MIRI")
     with pytest.raises(NoValidPixelsError, match="taken with MIRI; only NIRCam"):
         ExposureSequence.from_files([path])

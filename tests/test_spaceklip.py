@@ -332,16 +332,6 @@ def test_a_concatenation_from_frames_to_sources(kind, tmp_path, request):
     assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").candidates["snr"][0] > 5
 
 
-def test_a_flux_of_no_filter_is_refused(tmp_path):
-    database = StandIn(tmp_path, {KEY: concatenation(["one_calints.fits"])})
-    for flux, words in (
-        ({"F335M": 0.4}, r"'F335M'.*\['F444W'\]"),
-        ({"F444W": -0.4}, "expected 1e-06"),
-    ):
-        with pytest.raises(IncompatibleSetupError, match=words):
-            spaceklip.run_obs(database, opd=OPD, star_flux=flux)
-
-
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
@@ -349,6 +339,8 @@ def test_a_flux_of_no_filter_is_refused(tmp_path):
         ({"model_options": {"npx": 8}}, IncompatibleSetupError, "npx: not known to nircam_cor"),
         ({"pattern": "no.fits"}, IncompatibleSetupError, "pattern: got 'no.fits'"),
         ({"threshold": 0.0}, IncompatibleSetupError, "threshold: got 0.0"),
+        ({"star_flux": {"F335M": 0.4}}, IncompatibleSetupError, r"'F335M'.*\['F444W'\]"),
+        ({"star_flux": {"F444W": -0.4}}, IncompatibleSetupError, "expected 1e-06"),
     ],
 )
 def test_settings_are_checked_before_the_first_file_is_read(settings, error, message, tmp_path):
