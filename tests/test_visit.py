@@ -38,7 +38,7 @@ SIZE, NPIX = 32, 64
 FLUX, FLAT, DRIFT = 1e8, 0.02, 1e-9
 PLANET = Planet(3e-5, 0.7, 40.0)
 SETTINGS = FitSettings(
-    free=("star_offset", "flux", "background"), cycles=8.0,
+    free=("star_offset", "flux", "background"), cycles=7.0,
     prior=WavefrontPrior({"segment": 6.0, "texture": 3.0}, knee=1.0, fit_scales=False),
     companions_if_stalled=False, min_model_error=0.002, robust=3.0,
 )  # fmt: skip
