@@ -76,21 +76,20 @@ def table(places, contrasts):
     })  # fmt: skip
 
 
-@pytest.mark.parametrize("flux", [1.0, 2.0])
-def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(flux):
+def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be():
     """Relative to the star of the injection, even if it is brighter in the fit with planets."""
     sets = []
 
     def search(science):
         sets.append(science)
-        return searched(science, fit=SimpleNamespace(frames=[Frame(flux), Frame(2 * flux)]))
+        return searched(science, fit=SimpleNamespace(frames=[Frame(2.0), Frame(4.0)]))
 
     planets = recover_planets(searched(), 5, search)
     assert len(planets) == 5
     limit = 2 ** ((1.0 - planets["separation"].value) / 0.8) * LIMIT
     assert np.asarray(planets["injected"]) == pytest.approx(1.6 * limit)
     # What was measured at the place is what was injected there.
-    np.testing.assert_allclose(planets["contrast"], flux * planets["injected"])
+    np.testing.assert_allclose(planets["contrast"], 2.0 * planets["injected"])
     assert not planets["detected"].any()
     # Two in a field of 0.8 arcsec.
     assert [np.count_nonzero(each[0].data) for each in sets] == [2, 2, 1]
