@@ -560,7 +560,7 @@ def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario, tmp_path, m
     # Of the surveys, which are processes.
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[1]))
     try:
-        said = getattr(faults, scenario)(tmp_path, 1, 60)
+        said = getattr(faults, scenario)(tmp_path, 1, 20)
     except faults.MountingRefused as error:
         # The scenario mounts a small disk, which needs rights that not all have.
         pytest.skip(f"{scenario}: {error}")

@@ -69,7 +69,7 @@ def frames_of(planets, *rolls):
 def searched():
     """The search of two rolls of a star with three planets, and the whole frames."""
     frames = frames_of(PLANETS, *ROLLS)
-    settings, fitted = dr.FitSettings(cycles=8), model(FITTED)
+    settings, fitted = dr.FitSettings(cycles=6), model(FITTED)
     cut = [each.cutout(FITTED) for each in frames]
     fit = dr.refine(fitted, cut, OPD, settings=settings)
     # As in `reduce`, once more without the light of the sources beyond the fitted pixels.
