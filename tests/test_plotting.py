@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -138,6 +140,33 @@ def test_a_frame_is_drawn_from_its_star(frames):
     assert plain.get_xlabel() == "x from the star (arcsec)"
     assert ax.get_title(loc="left") == "HD 1, F444W"
     assert label_of(ax) == "photon"
+
+
+@pytest.mark.parametrize("angle", [0.0, 70.0, 200.0])
+def test_what_is_drawn_is_where_its_axes_say(frames, angle):
+    """A bright pixel, in the figure as it is rendered, has the offsets that its axes say."""
+    frame = replace(frames[0], position_angles=np.array([angle]))
+    data, valid = np.ones_like(frame.data), np.ones_like(frame.valid)
+    data[0, 22, 9] = 1e6
+    figure = Figure(figsize=(6, 6), dpi=100)
+    ax = figure.subplots()
+    replace(frame, data=data, valid=valid).plot(ax)
+    for each in (*ax.lines, *ax.child_axes):
+        each.set_visible(False)
+    ax.set_title("", loc="left")
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    rgb = np.asarray(canvas.buffer_rgba())[::-1, :, :3].astype(float)
+    box = ax.get_window_extent()
+    inside = np.zeros(rgb.shape[:2], dtype=bool)
+    inside[int(box.y0) + 3 : int(box.y1) - 2, int(box.x0) + 3 : int(box.x1) - 2] = True
+    # The lightest colour of the scale is nearly white, the other pixels are nearly black.
+    rows, columns = np.nonzero(inside & (rgb[..., 0] > 230))
+    seen = ax.transData.inverted().transform((columns.mean() + 0.5, rows.mean() + 0.5))
+    x, y = (np.array([9, 22]) - frame.center[0]) * frame.pixelscale
+    expected = on_sky(np.hypot(x, y), angle + np.rad2deg(np.arctan2(-x, y)))
+    # A pixel of the screen is 0.006 arcsec, one of the frame ten times as much.
+    np.testing.assert_allclose(seen, expected, atol=0.01)
 
 
 def test_a_system_shows_its_pupils_and_the_star(model):
