@@ -7,7 +7,7 @@ of them. A planet is in all rolls, and a source beyond the fitted pixels.
 import contextlib
 import io
 import json
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,10 +19,11 @@ from test_spaceklip import KEY, StandIn, concatenation
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
 from pyklip_diffrender import cli, spaceklip
-from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.detection import Detection, completeness
 from pyklip_diffrender.options import OPTIONS, SPECTRA
 from pyklip_diffrender.pattern import MeasuredPattern, PatternLibrary, combine_patterns
 from pyklip_diffrender.pyklip_backend.registration import reduce_jwst_files
+from pyklip_diffrender.reduction.pictures import ReportPictures
 from pyklip_diffrender.reduction.summary import summarise
 from pyklip_diffrender.refinement.fit_file import text_of
 from pyklip_diffrender.refinement.settings import nircam_settings
@@ -67,12 +68,20 @@ def small_settings(observation, **changes):
 
 
 def make_small(monkeypatch):
-    """Small models and few modes in every door, and no pattern but that which is given."""
+    """Small models and few modes in every door, and no pattern but that which is given.
+
+    Nothing is drawn, which takes half of the time and has tests of its own, and completeness is of
+    few planets.
+    """
     for place, function in (
         ("reduction.pipeline.model_for", small_model),
         ("pyklip_backend.subtract.model_for", small_model),
         ("refinement.settings.nircam_settings", small_settings),
         ("pattern.choice.package_library", PatternLibrary),
+        ("reduction.pipeline.completeness", partial(completeness, angles=4)),
+        ("reduction.products.Klip.of", lambda _: None),
+        ("reduction.products.ReportPictures.of", lambda *_: ReportPictures()),
+        ("drawing.save", lambda _, path, **__: Path(path).write_bytes(b"no picture")),
         ("drawing.to_png", lambda *_, **__: b"no picture"),
     ):
         monkeypatch.setattr(f"pyklip_diffrender.{place}", function)
