@@ -333,8 +333,9 @@ OTHER_DOORS = (through_klip_dataset, through_spaceklip, through_a_survey)
         ("3", "03107", OTHER_DOORS[:1]),
         *(
             pytest.param(visits, exposure, OTHER_DOORS, marks=pytest.mark.slow)
+            # Both rolls of each star in each filter, and single rolls of two stars.
             for exposure in ("03106", "03107")
-            for visits in ("12", "34", "56", *"123456")
+            for visits in ("12", "34", "56", "2", "5")
         ),
     ],
 )  # fmt: skip

@@ -151,7 +151,7 @@ def test_references_are_nine_dithered_frames_of_the_reference_star():
 
 @pytest.mark.slow
 def test_the_demo_finds_the_planet_that_klip_loses(tmp_path):
-    result = run_demo(size=48)
+    result = run_demo(size=36)
     names = ["initial", "KLIP", "refined", "detected", "optimal"]
     assert list(result.table["star model"]) == names
     assert result.fit.status is dr.Status.CONVERGED
