@@ -51,8 +51,6 @@ from pyklip_diffrender.refinement import FitSettings
 
 PRODUCT = "x-KLmodes-all.fits"
 
-# pyKLIP 2.10 takes the mean of sections that are all NaN.
-
 
 @pytest.fixture
 def imgs(rng):

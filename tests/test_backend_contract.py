@@ -13,8 +13,6 @@ from pyklip.instruments.utils import wcsgen
 
 from pyklip_diffrender import pyklip_backend
 
-# pyKLIP 2.10 takes the mean of sections that are all NaN.
-
 
 class PipelineData(Data):
     """A dataset in memory, as corgidrp makes it, with what `Data` demands and no headers."""

@@ -13,7 +13,7 @@ from pyklip.instruments.JWST import JWSTData
 from pyklip.klip import high_pass_filter
 
 from pyklip_diffrender import pyklip_backend
-from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.errors import DiffrenderWarning
 
 NATIVE = (20.7, 25.2)
 MIDDLE = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
@@ -76,14 +76,6 @@ def test_the_fit_gets_recorded_pixels_errors_flags_and_headers(files, rng):
     assert observation.date.isot.startswith("2022-07-30T01:02:03")
     cards = observation.header
     assert (cards["CORONMSK"], cards["BUNIT"]) == ("MASKA335R", "MJy/sr")
-
-
-def test_filters_are_reduced_one_by_one(tmp_path, rng):
-    paths = [str(tmp_path / f"{name}.fits") for name in ("F356W", "F444W")]
-    for path, name in zip(paths, ("F356W", "F444W"), strict=True):
-        calints(path, rng, center=NATIVE, nints=1, FILTER=name)
-    with pytest.raises(IncompatibleSetupError, match=r"got 2 wavelengths .*each filter"):
-        reduce(JWSTData(paths), tmp_path / "out")
 
 
 def test_center_keywords_and_dithers(tmp_path, rng):

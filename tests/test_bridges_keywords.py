@@ -287,6 +287,7 @@ def test_weights_alone_are_those_of_the_systems_wavelengths(poppy_system):
     model = from_poppy(poppy_system, WAVES)
     theirs = poppy_system.calc_psf(WAVES * u.m, weight=[1.0, 3.0])
     same(model.calc_psf(weight=[1.0, 3.0]), theirs, 1e-12)
+    same(from_poppy(poppy_system, WAVES * u.m, [1.0, 3.0]).calc_psf(), theirs, 1e-12)
     with pytest.raises(ShapeError, match="2 wavelengths and 3 weights"):
         model.calc_psf(weight=[1.0, 3.0, 1.0])
 

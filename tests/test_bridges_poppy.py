@@ -146,14 +146,6 @@ def test_random_systems(seeds, least):
     assert len(seeds) - len(refusals) >= least
 
 
-def test_several_wavelengths_with_weights():
-    system = make(PUPIL, ZERNIKES, SPOT, STOP)
-    waves, weights = [4e-6, 4.4e-6, 5e-6] * u.m, [1.0, 2.0, 3.0]
-    truth = system.calc_psf(waves, weight=weights)
-    model = from_poppy(system, waves, weights)
-    assert relative(model.calc_psf()[0].data, truth[0].data) < 1e-12
-
-
 def test_an_exit_pupil_is_normalised():
     # A stop that ends inside the array: poppy's exit pupil is the padded one.
     system = make(PUPIL, SPOT, ("pupil", poppy.CircularAperture(radius=2.6 * u.m)))
