@@ -268,15 +268,23 @@ class Request(NamedTuple):
         pattern = self.world.patterns_by_hand[self.pattern_file]
         return {"pattern": str(pattern if self.pattern_file == "library" else pattern[filter_])}
 
+    def options_in(self, filter_):
+        """Options in a filter, with those for the pattern and the star's flux density."""
+        options = self.options | self.pattern_option(filter_)
+        if self.star == "flux":
+            options["star_flux"] = self.world.star_flux[filter_]
+        if self.star == "sed":
+            options["star_sed"] = str(self.world.star_sed)
+        return options
+
 
 def through_python(request, folder):
     world, made = request.world, []
     for each in dr.ExposureSequence.by_filter_and_epoch(request.files, target=TARGET):
-        options = request.options | request.pattern_option(each.filter)
-        if request.star == "flux":
-            options["star_flux"] = world.star_flux[each.filter]
-        if request.star == "sed":
-            options["star_flux"] = dr.instrument.star_flux_density(world.star_sed, each.filter)
+        options = request.options_in(each.filter)
+        if "star_sed" in options:
+            spectrum = options.pop("star_sed")
+            options["star_flux"] = dr.instrument.star_flux_density(spectrum, each.filter)
         made.append(dr.reduce(each, world.map, size=SIZE, **options))
     combined = dr.combine(made, spectra=request.spectra).to_dict() if len(made) > 1 else None
     return Found([each.detection for each in made], list(map(summarise, made)), combined)
@@ -315,11 +323,7 @@ def _products(folders):
 
 
 def through_klip_dataset(request, folder):
-    world, options = request.world, request.options | request.pattern_option(request.filters[0])
-    if request.star == "flux":
-        options["star_flux"] = world.star_flux[request.filters[0]]
-    if request.star == "sed":
-        options["star_sed"] = world.star_sed
+    world, options = request.world, request.options_in(request.filters[0])
     if request.spectra != SPECTRA:
         options["spectra"] = request.spectra
     science, references = _by_use(request.files)
@@ -339,11 +343,9 @@ def _by_use(files):
 
 
 def through_spaceklip(request, folder):
-    world, options = request.world, request.options | request.pattern_option(request.filters[0])
-    if request.star == "flux":
+    world, options = request.world, request.options_in(request.filters[0])
+    if "star_flux" in options:
         options["star_flux"] = {name: world.star_flux[name] for name in request.frames}
-    if request.star == "sed":
-        options["star_sed"] = world.star_sed
     tables = {}
     for name, files in request.frames.items():
         tables[KEY.replace("F444W", name)] = table = concatenation(list(map(str, files)))
@@ -363,13 +365,9 @@ def through_spaceklip(request, folder):
 def through_a_survey(request, folder):
     world, sequences = request.world, []
     for name, files in request.frames.items():
-        options = request.options | request.pattern_option(name)
+        options = request.options_in(name)
         if "injections" in options:
             options["injections"] = {"contrasts": [4e-5], "separations": [0.6], "angles": [300.0]}
-        if request.star == "flux":
-            options["star_flux"] = world.star_flux[name]
-        if request.star == "sed":
-            options["star_sed"] = str(world.star_sed)
         sequences.append({
             "files": list(map(str, files)), "opd": str(world.map), "size": SIZE, "target": TARGET,
             "name": name, **options,
