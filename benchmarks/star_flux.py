@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 from astropy import units as u
-from astropy.table import QTable
+from astropy.table import Table
 
 import pyklip_diffrender as dr
 from benchmarks.provenance import provenance
@@ -92,7 +92,7 @@ def flux_of_type(star: str, band: str) -> float:
     return float(dr.instrument.star_flux_density(text, band).to_value(u.Jy))
 
 
-def beside_photometry(folder: Path) -> QTable:
+def beside_photometry(folder: Path) -> Table:
     """Make a table of the flux densities of fits and of photometry, one row for each fit."""
     rows = []
     for path in sorted(folder.glob("*/row.json")):
@@ -101,16 +101,16 @@ def beside_photometry(folder: Path) -> QTable:
         if star in PHOTOMETRY:
             about = {name: row[name] for name in ("star", "filter", "rolls", "library")}
             rows.append({
-                **about, "references": row["references"], "fitted": row["star Jy"] * u.Jy,
-                "wise": flux_of_wise(star, band) * u.Jy,
-                "type_and_ks": flux_of_type(star, band) * u.Jy,
+                **about, "references": row["references"], "fitted": row["star Jy"],
+                "wise": flux_of_wise(star, band),
+                "type_and_ks": flux_of_type(star, band),
             })  # fmt: skip
-    table = QTable(rows)
+    table = Table(rows)
     table.meta = provenance("benchmarks.star_flux --photometry FOLDER --table FILE")
     for name in ("fitted", "wise", "type_and_ks"):
-        table[name].info.format = ".4g"
-    table["wise"].info.description = "power law between W1 and W2"
-    table["type_and_ks"].info.description = "star_flux_density of spectral type and Ks"
+        table[name].unit, table[name].format = "Jy", ".4g"
+    table["wise"].description = "power law between W1 and W2"
+    table["type_and_ks"].description = "star_flux_density of spectral type and Ks"
     return table
 
 
