@@ -216,15 +216,19 @@ def _permitted(listing: QTable) -> QTable:
 @contextmanager
 def _asking() -> Iterator[None]:
     """Turn what goes wrong between here and the archive into errors that say so."""
-    from astroquery.exceptions import NoResultsWarning, RemoteServiceError, TimeoutError
+    from astroquery import exceptions
     from requests import RequestException
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NoResultsWarning)
+            warnings.simplefilter("ignore", exceptions.NoResultsWarning)
             yield
-    # Astroquery lets exceptions of requests through.
-    except (RequestException, ConnectionError, TimeoutError, RemoteServiceError) as error:
+    except (
+        RequestException,  # Astroquery lets these through.
+        ConnectionError,
+        exceptions.TimeoutError,
+        exceptions.RemoteServiceError,
+    ) as error:
         raise ArchiveError(
             f"MAST cannot be reached ({type(error).__name__}: {error}). Check the network, or "
             "download the files from https://mast.stsci.edu and pass them"

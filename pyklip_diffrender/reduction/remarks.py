@@ -1,4 +1,4 @@
-"""What is said of a fit, of its OPD map, and of candidates that look like extended light."""
+"""Remarks on a fit, on its OPD map, and on candidates that look like extended light."""
 
 from __future__ import annotations
 
