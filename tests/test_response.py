@@ -107,7 +107,7 @@ def test_responses_that_are_not_stored_are_the_same():
     last = Reading(ResponseCache(model, basis, npix=64), 0.05, 1, is_last=True)
     assert not last.near(start, VALUES).stored
     every = []
-    for memory in (math.inf, 8 * len(basis) * 20 * 24, 100.0):
+    for memory in (math.inf, 4 * len(basis) * 20 * 24, 100.0):
         cache = ResponseCache(model, basis, npix=64, memory=memory)
         responses = Reading(cache, 0.05, 2, is_last=False)
         places = (start, start + 2e-7 * model.entrance.lit)
@@ -117,7 +117,8 @@ def test_responses_that_are_not_stored_are_the_same():
         every.append([each.image(fields, VALUES, 5) for each in (near, far)])
     for others in every[1:]:
         for image, expected in zip(others, every[0], strict=True):
-            assert float((image - expected).norm() / expected.norm()) < 1e-6
+            # What is stored is rounded to 2^-11 of every number.
+            assert float((image - expected).norm() / expected.norm()) < 5e-4
     assert float((every[0][0] - every[0][1]).norm() / every[0][0].norm()) > 0.01
 
 
@@ -160,7 +161,8 @@ def test_derivatives_follow_changes_in_the_last_pupil(route):
     assert relative(followed, expected) < 0.35 * relative(old, expected)
     assert relative(followed, expected, 12) < 0.2 * relative(old, expected, 12)
     kept.follow(last, before)
-    assert relative(stored(kept), old) < 1e-5
+    # Three times rounded to 2^-11 of every number.
+    assert relative(stored(kept), old) < 1e-3
 
 
 @pytest.mark.hard

@@ -304,6 +304,11 @@ def is_short_wave(filter: str) -> bool:
     return filter.upper() in SHORT_WAVE
 
 
+def is_wide_band(filter: str) -> bool:
+    """Whether a filter's band is wide, a quarter of its wavelength, and not medium or narrow."""
+    return filter.upper().rstrip("2").endswith("W")
+
+
 def require_mask(mask: str) -> RoundMask | BarMask:
     """Return the mask of this name; IncompatibleSetupError if it is not one of `MASKS`."""
     if mask not in MASKS:
