@@ -224,18 +224,27 @@ def survey_figure() -> Figure:
 
 
 def time_figure() -> Figure:
-    """How the time of a fit grows, from the table of `benchmarks.growth`."""
+    """How times grow: of a fit (`benchmarks.growth`) and of a survey (`benchmarks.survey_growth`)."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    fits, surveys = figure.subplots(1, 2)
     table = Table.read(RESULTS / "growth.ecsv")
-    figure = Figure(figsize=(6.5, 4), layout="constrained")
-    ax = figure.subplots()
     for k, name in enumerate(dict.fromkeys(map(str, table["size"]))):
         rows = table[table["size"] == name]
         size = rows["value"] / rows["value"][0]
-        ax.loglog(size, rows["fit"], f"C{k}o-", label=f"{name} from {rows['value'][0]:g}")
-        ax.loglog(size, rows["counted"], f"C{k}--", lw=1)
-    ax.plot([], [], "k--", lw=1, label="counted operations")
-    ax.set(xlabel="size over the smallest", ylabel="processor time of a fit (s)")
-    ax.legend(frameon=False, fontsize=8)
+        fits.loglog(size, rows["fit"], f"C{k}o-", label=f"{name} from {rows['value'][0]:g}")
+        fits.loglog(size, rows["counted"], f"C{k}--", lw=1)
+    fits.plot([], [], "k--", lw=1, label="counted operations")
+    fits.set(xlabel="size over the smallest", ylabel="processor time of a fit (s)")
+    table = Table.read(RESULTS / "survey_growth.ecsv")
+    for k, workers in enumerate(sorted(set(map(int, table["workers"])))):
+        for kind, style in (("simulated", "-"), ("measured", "o")):
+            rows = table[(table["workers"] == workers) & (table["kind"] == kind)]
+            label = f"{workers} worker{'s' if workers > 1 else ''}" if style == "-" else None
+            surveys.loglog(rows["stars"], rows["seconds"], f"C{k}{style}", label=label)
+    surveys.plot([], [], "ko", label="measured")
+    surveys.set(xlabel="stars of a survey", ylabel="time of a survey (s)")
+    for ax in (fits, surveys):
+        ax.legend(frameon=False, fontsize=8)
     return figure
 
 

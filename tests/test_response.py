@@ -61,13 +61,16 @@ SHEARED = {"pixelscale": (0.05, 0.08), "shear": 0.2, "oversample": 2}
     [
         ({}, NPIX, 1e-3),
         ({"npix": 128, **SHEARED}, 128, 1e-3),
-        ({"npix": 128, "route": "planes"}, 128, 1e-4),
+        ({"npix": 128, "route": "planes"}, 128, 3e-4),
         ({"monochromatic": None, "nlambda": 2}, 128, 0.025),
     ],
     ids=str,
 )
 def test_wavefront_response_is_the_slope_of_the_fine_model(changes, npix, tolerance):
-    """To the wrapped light of the occulter on the same grid; a coarse copy is off by a percent."""
+    """To the wrapped light of the occulter on the same grid; a coarse copy is off by a percent.
+
+    Half precision, in which derivatives are stored, has a relative error of 2e-4 rms.
+    """
     model = system(**changes)
     opd = downsample(OPD, model.npix)
     response = WavefrontResponse(model, BASIS, opd, VALUES, npix=npix)
