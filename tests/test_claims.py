@@ -162,8 +162,10 @@ def claims():
                for band in BOTH]  # fmt: skip
     demo = [1e6 * stated("demo: contrast"), 1e6 * stated("demo: contrast", "error")]
     snr = stated("S/N of the companion")
+    dwarfs = ("G-7-34", "HIP17695")
     like_with_like = [middle(LIKE, "ratio", star=star, filter=band, **SAME)
-                      for star in ("G-7-34", "HIP17695") for band in BOTH]  # fmt: skip
+                      for star in dwarfs for band in BOTH]  # fmt: skip
+    least_of_dwarfs = min(least(LIKE, "ratio", star=star, **SAME) for star in dwarfs)
     scatter = np.prod([table("visits_null")[name] for name in ("scatter", "factor")], axis=0)
     pulls = table("visit_planets")
     stars = table("star_flux")[table("star_flux")["rolls"] == "pair"]
@@ -173,7 +175,7 @@ def claims():
     visits = table("reference_sequences").group_by("visit").groups.aggregate(np.median)
     return (
         (README, "| the same | {:.1f} to {:.1f} | once, within 0.7 arcsec, up to {:.1f} times |",
-         [f(like_with_like) for f in (min, max)] + [1 / least(LIKE, "ratio", **SAME)]),
+         [f(like_with_like) for f in (min, max)] + [1 / least_of_dwarfs]),
         (README, "| all | all | {:.2f} | at some separations, up to {:.1f} times |",
          [np.median(visits["klip_over_ours_raw"]),
           1 / least("reference_sequences", "klip_over_ours_raw")]),
