@@ -224,7 +224,7 @@ def survey_figure() -> Figure:
 
 
 def time_figure() -> Figure:
-    """How the times of a fit (`benchmarks.growth`) and a survey (`benchmarks.survey_growth`) grow."""
+    """How times of fits (`benchmarks.growth`) and surveys (`benchmarks.survey_growth`) grow."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     fits, surveys = figure.subplots(1, 2)
     table = Table.read(RESULTS / "growth.ecsv")
