@@ -48,7 +48,8 @@ class Unknown(NamedTuple):
 class FrameRows:
     """Unknowns of a fit to which the rows of one frame belong."""
 
-    rows: Tensor  # (rows,), int64, index of the unknown of each row.
+    # (rows,), int64, index of the unknown of each row; for a row without one, their number.
+    rows: Tensor
     # (blocks, some), int64, indices of the unknowns by which the leading wavefront modes of this
     # frame differ from the shared modes. One block may belong to this frame alone, and another
     # block to all frames of an exposure sequence.
@@ -57,16 +58,16 @@ class FrameRows:
 
     def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
         """Sum values by row, (rows, k), to values by unknown, (size, k)."""
-        total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
+        total = torch.zeros(size + 1, *on_rows.shape[1:], dtype=on_rows.dtype)
         total.index_add_(0, self.rows, on_rows)
         leading = on_rows[self.first_mode : self.first_mode + self.drift.shape[-1]]
         for block in self.drift:
             total.index_add_(0, block, leading)
-        return total
+        return total[:size]
 
     def of_unknowns(self, values: Tensor) -> Tensor:
         """Values by row from values by unknown; the adjoint of `onto_unknowns`."""
-        rows = values[self.rows]
+        rows = torch.cat([values, torch.zeros_like(values[:1])])[self.rows]
         for block in self.drift:
             rows[self.first_mode : self.first_mode + len(block)] += values[block]
         return rows
@@ -489,21 +490,21 @@ class LinearModel:
             Image of these unknowns by frame, in the data's unit.
         """
         keeps = torch.tensor([unknown.name != name for unknown in self.unknowns])
-        # `place` is the new index of every unknown that stays.
-        place = torch.cumsum(keeps, 0) - 1
+        # `place` is the new index of every unknown that stays. The Jacobians, the largest arrays,
+        # are shared: rows of the other unknowns are left without an unknown.
+        none = int(keeps.sum())
+        stays = torch.where(keeps, torch.cumsum(keeps, 0) - 1, none)
+        place = torch.cat([stays, torch.tensor([none])])
         frames = []
         for k, frame in enumerate(self.frames):
-            rows = keeps[frame.rows]
             counts = frame.weight > 0
             companions = torch.as_tensor(light.get(k, 0.0), dtype=torch.float64)
             frames.append(
                 replace(
                     frame,
                     residual=torch.where(counts, frame.residual + companions, 0.0),
-                    jacobian=frame.jacobian[rows],
-                    rows=place[frame.rows[rows]],
+                    rows=place[frame.rows],
                     drift=place[frame.drift],
-                    first_mode=frame.first_mode - int((~rows[: frame.first_mode]).sum()),
                 )
             )
         remaining = torch.nonzero(keeps).flatten()
