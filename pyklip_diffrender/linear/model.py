@@ -312,7 +312,7 @@ class LinearModel:
         """Lower Cholesky factor of P + G G^T, in scaled units."""
         # Unknowns differ by many powers of ten. In the units U, U (P + G G^T) U is factored, whose
         # diagonal is 1.
-        system = self.curvature * self._scale[:, None] * self._scale
+        system = (self.curvature * self._scale[:, None]).mul_(self._scale)
         system.diagonal().add_((self._scale / self.deviation) ** 2)
         return torch.linalg.cholesky(system)
 
@@ -361,7 +361,12 @@ class LinearModel:
     @cached_property
     def _pattern_rows(self) -> Tensor:
         """R of the shared pattern, see `_pulled`, (unknowns, pixels), float32."""
-        return torch.cat(list(summed_rows(self.frames, len(self.vector))), dim=1)
+        # Filled piece by piece: to concatenate the pieces takes twice the memory.
+        count, pixels = len(self.vector), self.frames[0].weight.numel()
+        rows = torch.empty(count, pixels, dtype=torch.float32)
+        for piece, part in zip(pixel_pieces(pixels), summed_rows(self.frames, count), strict=True):
+            rows[:, piece] = part
+        return rows
 
     def _pulled(self, images: Mapping[int, Tensor]) -> Tensor:
         """J C^-1 x of images x, (k, ny, nx) by frame, (unknowns, k), float64."""
