@@ -191,6 +191,7 @@ def test_unknowns_can_be_taken_out_and_their_light_put_back(pair):
     assert first.rows.tolist() == [0, len(less.unknowns), 2, 3, 4]
     assert first.drift.tolist() == [[5, 6]]
     assert first.jacobian is pair.frames[0].jacobian
+    assert less.names_before_modes(0) == ["flux", "", "lyot_rotation"]
     seen = first.weight > 0
     added = (first.residual - pair.frames[0].residual)[seen]
     torch.testing.assert_close(added, torch.as_tensor(light[0])[seen])

@@ -301,6 +301,12 @@ class LinearModel:
             tuple(frame.common for frame in self.frames),
         )
 
+    def names_before_modes(self, k: int) -> list[str]:
+        """Names of the unknowns of frame `k` by row, before its modes; "" for a row without one."""
+        names = [*(unknown.name for unknown in self.unknowns), ""]
+        frame = self.frames[k]
+        return [names[row] for row in frame.rows[: frame.first_mode].tolist()]
+
     @cached_property
     def _scale(self) -> Tensor:
         """Units of the unknowns in which the curvature's diagonal is of order 1."""
