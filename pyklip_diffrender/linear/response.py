@@ -370,27 +370,6 @@ def downsample(opd: Tensor, npix: int) -> Tensor:
     return (rows.unflatten(-1, (npix, factor)) @ mean).squeeze(-1)
 
 
-class _StoredFields:
-    """Complex fields, (count, ny, nx), in half precision relative to the peak of each field.
-
-    The rounding, 5e-4 of each number, is far below the errors of a coarse model.
-    """
-
-    def __init__(self, count: int, shape: tuple[int, int], device: torch.device) -> None:
-        self._peaks = torch.zeros(count, 1, 1, 1, device=device)
-        self._halves = torch.zeros(count, *shape, 2, dtype=torch.float16, device=device)
-
-    def __getitem__(self, which: slice) -> Tensor:
-        """Fields as complex64, a copy."""
-        return torch.view_as_complex(self._halves[which].float().mul_(self._peaks[which]))
-
-    def __setitem__(self, which: slice | Tensor, fields: Tensor) -> None:
-        numbers = torch.view_as_real(fields.to(torch.complex64))
-        peaks = numbers.abs().amax(dim=(1, 2, 3), keepdim=True)
-        self._peaks[which] = peaks
-        self._halves[which] = (numbers / peaks.clamp(min=1e-30)).half()
-
-
 class WavefrontResponse:
     """Derivative of the complex field on the detector with respect to wavefront modes.
 
@@ -416,9 +395,9 @@ class WavefrontResponse:
         # computed from it and from the current field of the star.
         self.coarse = coarse = coarse_copy(at_few_wavelengths(model, wavelengths), npix)
         self._progress = progress
-        self._fields: list[_StoredFields] | None = None
+        self._fields: list[Tensor] | None = None
         pixels = math.prod(model.detector.shape) * model.detector.oversample**2
-        self.size = 4 * len(basis) * pixels * len(coarse.bandpass.wavelengths)
+        self.size = 8 * len(basis) * pixels * len(coarse.bandpass.wavelengths)
         """Size of the stored derivatives, bytes."""
         # Behind the occulter, arrays are padded to twice the size of the image.
         samples = max(math.prod(coarse.entrance.grid.shape), 4 * pixels)
@@ -436,13 +415,13 @@ class WavefrontResponse:
         ny, nx = (n * self.model.detector.oversample for n in self.model.detector.shape)
         count = len(self.basis)
         fields = [
-            _StoredFields(count, (ny, nx), self.model.device)
+            torch.empty(count, ny, nx, dtype=torch.complex64, device=self.model.device)
             for _ in self.coarse.bandpass.wavelengths
         ]
         with ProgressBar("response", count, shown=self._progress) as bar:
             for modes, changes in self._batches():
                 for kept, change in zip(fields, changes, strict=True):
-                    kept[modes] = change
+                    kept.index_copy_(0, modes.to(kept.device), change)
                 bar.update(len(modes))
         self._fields, self._mode_fields = fields, None
         _log.debug("response of %d modes at %d pupil samples", count, self.coarse.npix)
@@ -450,11 +429,7 @@ class WavefrontResponse:
     def follow(self, last_pupil: LastPupil, values: dict[str, Tensor]) -> None:
         """Follow a change of parameters that `LastPupil.multiply` can follow."""
         if self._fields is not None:
-            for part in _parts(len(self.basis)):
-                fields = [kept[part] for kept in self._fields]
-                last_pupil.multiply(fields, self._values, values)
-                for kept, followed in zip(self._fields, fields, strict=True):
-                    kept[part] = followed
+            last_pupil.multiply(self._fields, self._values, values)
         self._values, self._mode_fields = values, None
 
     def forget(self) -> None:
@@ -471,8 +446,10 @@ class WavefrontResponse:
                 self._mode_fields = ModeFields(self.coarse, self.basis, self._opd, self._values)
             yield from self._mode_fields.batches(self._batch)
             return
-        for part in _parts(len(self.basis) if count is None else count):
-            yield torch.arange(part.start, part.stop), [kept[part] for kept in self._fields]
+        every = torch.arange(len(self.basis) if count is None else count)
+        for modes in every.split(_MODES_AT_A_TIME):
+            part = slice(int(modes[0]), int(modes[-1]) + 1)
+            yield modes, [kept[part] for kept in self._fields]
 
     def image(
         self,
@@ -506,12 +483,6 @@ class WavefrontResponse:
                 elif wanted.any():
                     rows[places[wanted]] = detector.image(parts[wanted], values)
         return images
-
-
-def _parts(count: int) -> Iterator[slice]:
-    """Parts of `count` modes, at most `_MODES_AT_A_TIME` in each."""
-    for start in range(0, count, _MODES_AT_A_TIME):
-        yield slice(start, min(start + _MODES_AT_A_TIME, count))
 
 
 def _weighted_sum(changes: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:

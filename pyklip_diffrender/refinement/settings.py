@@ -177,7 +177,7 @@ class FitSettings:
         Memory that the process should take, bytes or such as "2 GB", including 1.3 GB for the
         process itself. Derivatives that do not fit are computed in parts whenever they are needed,
         which takes longer and gives the same result. The Jacobians of the frames are always
-        stored, so that a low limit may be exceeded. By default derivatives take up to 1.5 GB.
+        stored, so that a low limit may be exceeded. By default derivatives take up to 2 GB.
 
     Raises
     ------

@@ -68,8 +68,9 @@ _AS_PREDICTED, _BELOW_PREDICTED = 0.7, 0.3
 grows. Between them the linear model is neither good nor bad, and the damping stays; trust-region
 methods have similar limits (Nocedal and Wright 2006, Numerical Optimization, algorithm 4.1)."""
 
-_RESPONSES_BYTES = 1.5e9
-"""Largest number of bytes of stored derivatives: of eight frames in F444W on 80 x 80 pixels."""
+_RESPONSES_BYTES = 2e9
+"""Largest number of bytes of stored derivatives: of five frames in F444W on 80 x 80 pixels, or of
+seven in F210M."""
 
 _FINAL_DERIVATIVE_ERROR = 0.01
 """Largest error of the derivatives in the linear model that gives the errors of a fit. With 0.05,
