@@ -15,11 +15,13 @@ from pyklip_diffrender.linear.response import (
     Reading,
     ResponseCache,
     WavefrontResponse,
+    at_few_wavelengths,
     coarse_copy,
     downsample,
 )
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.refinement import FitSettings
 from pyklip_diffrender.wavefront import WavefrontPrior, random_opd
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.wavefront.priors import solve_with_evidence
@@ -98,6 +100,24 @@ def test_wavefront_response_takes_the_field_of_the_star_it_is_asked_about():
     assert error < 0.6 * old_error
     fields = [2 * field for field in model.fields(OPD, **VALUES)]
     torch.testing.assert_close(response.image(fields, VALUES), 2 * here, rtol=1e-6, atol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["F210M", "F444W"])
+def test_the_preset_has_wavelengths_enough_for_the_derivatives_of_a_filter(name):
+    """Against nine wavelengths, at the size at which the finest modes reach the edge."""
+    settings, basis = FitSettings.nircam(name), FourierModes(8)
+    model = nircam_coronagraph(name, npix=128, fov_pixels=36, nlambda=9)
+    images = [
+        WavefrontResponse(model, basis, downsample(OPD, 128), {}, wavelengths=count).image(
+            at_few_wavelengths(model, count).fields(downsample(OPD, 128)), model.values({})
+        )
+        for count in (settings.response_wavelengths, settings.response_wavelengths - 2, 9)
+    ]
+    error, with_fewer = (
+        float((each - images[-1]).norm() / images[-1].norm()) for each in images[:2]
+    )
+    assert error < 0.03 < with_fewer
 
 
 def test_responses_that_are_not_stored_are_the_same():
