@@ -29,14 +29,15 @@ def frame(k, rows, drift, first_mode):
 
 def dense(model):
     """Whitened Jacobian (unknowns, pixels), data about the prior's mean, prior covariance."""
-    columns, data = [], []
+    columns, data, count = [], [], len(model.vector)
     for part in model.frames:
-        jacobian = torch.zeros(len(model.vector), NY * NX, dtype=torch.float64)
+        # The last row is of rows without an unknown.
+        jacobian = torch.zeros(count + 1, NY * NX, dtype=torch.float64)
         white = (part.jacobian.double() * part.weight).flatten(1)
         drifting = [(part.first_mode + k, u) for k, u in enumerate(part.drift[0].tolist())]
         for row, unknown in [*enumerate(part.rows.tolist()), *drifting]:
             jacobian[unknown] += white[row]
-        columns.append(jacobian)
+        columns.append(jacobian[:count])
         data.append((part.weight * part.residual).flatten())
     jacobian = torch.cat(columns, dim=1)
     about_mean = torch.cat(data) + jacobian.T @ (model.vector - model.mean)
@@ -187,12 +188,28 @@ def test_unknowns_can_be_taken_out_and_their_light_put_back(pair):
     assert less.unknowns == tuple(u for u in pair.unknowns if u.name != "companions")
     assert len(less.unknowns) == len(pair.unknowns) - 1
     first = less.frames[0]
-    assert first.rows.tolist() == [0, 2, 3, 4]
+    assert first.rows.tolist() == [0, len(less.unknowns), 2, 3, 4]
     assert first.drift.tolist() == [[5, 6]]
-    assert first.first_mode == 2
+    assert first.jacobian is pair.frames[0].jacobian
+    assert less.names_before_modes(0) == ["flux", "", "lyot_rotation"]
     seen = first.weight > 0
     added = (first.residual - pair.frames[0].residual)[seen]
     torch.testing.assert_close(added, torch.as_tensor(light[0])[seen])
     assert float(first.residual[~seen].abs().max()) == 0.0
     jacobian, _, _ = dense(less)
     torch.testing.assert_close(less.curvature, jacobian @ jacobian.T)
+    # The same model with frames that never had the row.
+    stays = torch.tensor([0, 2, 3, 4])
+    parts = (
+        replace(part, jacobian=part.jacobian[stays], rows=part.rows[stays], first_mode=2)
+        for part in less.frames
+    )
+    never, templates = replace(less, frames=tuple(parts)), {1: random(3, NY, NX, seed=71)}
+    for method in ("weigh", "response", "clean"):
+        torch.testing.assert_close(
+            getattr(less, method)(templates), getattr(never, method)(templates)
+        )
+    assert less.without("flux", {}).unknowns == never.without("flux", {}).unknowns
+    torch.testing.assert_close(
+        less.without("flux", {}).weigh(templates), never.without("flux", {}).weigh(templates)
+    )

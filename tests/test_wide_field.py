@@ -633,6 +633,8 @@ def test_planets_are_found_beside_a_ring_and_not_next_to_it():
     frames = planets_in(rolls(BRIGHTNESS)[0], [next_to], 1e-6)
     again = with_disk(planets_in(frames, places, 2 * limit))
     found = dr.detect(again.fit, without_limits=again.hides_points).candidates
+    # At 0.2 arcsec an error of the wavefront has an S/N of 5, a little more or less by rounding.
+    found = found[found["separation"].to_value("arcsec") > 0.5]
     there = np.stack([found["x"].value, found["y"].value], axis=-1)
     away = np.linalg.norm(there[:, None] - places, axis=-1)
     assert sorted(away.argmin(axis=1)) == [0, 1, 2]

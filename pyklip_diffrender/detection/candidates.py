@@ -474,7 +474,7 @@ def _offset_products(templates: Templates, k: int, offset: Tensor) -> tuple[Tens
     model = model.at_wavelengths(model.bandpass.thinned(1))
     opd = downsample(torch.from_numpy(fitted.opd.copy()), model.npix)
     grid = PupilGrid.full(model.npix, model.diameter)
-    names = [linear.unknowns[unknown].name for unknown in frame.rows[: frame.first_mode].tolist()]
+    names = linear.names_before_modes(k)
 
     def image(change: Tensor, moved: Tensor | float = 0.0) -> Tensor:
         values = fitted.optical_values
@@ -537,8 +537,8 @@ def calibration_errors(
     for k, fitted in templates.frames.items():
         frame = linear.frames[k]
         on_rows = torch.zeros(len(frame.rows), 2 * count, dtype=torch.float64)
-        for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
-            if linear.unknowns[unknown].name == "flux":
+        for row, name in enumerate(linear.names_before_modes(k)):
+            if name == "flux":
                 on_rows[row, :count] = 1 / fitted.flux
         for j in torch.nonzero((snr > _OWN_ERROR_SNR) & ~contained).flatten().tolist():
             by_modes = _by_modes(templates, k, frame, offsets[j])

@@ -48,7 +48,8 @@ class Unknown(NamedTuple):
 class FrameRows:
     """Unknowns of a fit to which the rows of one frame belong."""
 
-    rows: Tensor  # (rows,), int64, index of the unknown of each row.
+    # (rows,), int64, index of the unknown of each row; for a row without one, their number.
+    rows: Tensor
     # (blocks, some), int64, indices of the unknowns by which the leading wavefront modes of this
     # frame differ from the shared modes. One block may belong to this frame alone, and another
     # block to all frames of an exposure sequence.
@@ -57,16 +58,16 @@ class FrameRows:
 
     def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
         """Sum values by row, (rows, k), to values by unknown, (size, k)."""
-        total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
+        total = torch.zeros(size + 1, *on_rows.shape[1:], dtype=on_rows.dtype)
         total.index_add_(0, self.rows, on_rows)
         leading = on_rows[self.first_mode : self.first_mode + self.drift.shape[-1]]
         for block in self.drift:
             total.index_add_(0, block, leading)
-        return total
+        return total[:size]
 
     def of_unknowns(self, values: Tensor) -> Tensor:
         """Values by row from values by unknown; the adjoint of `onto_unknowns`."""
-        rows = values[self.rows]
+        rows = torch.cat([values, torch.zeros_like(values[:1])])[self.rows]
         for block in self.drift:
             rows[self.first_mode : self.first_mode + len(block)] += values[block]
         return rows
@@ -300,6 +301,12 @@ class LinearModel:
             tuple(frame.common for frame in self.frames),
         )
 
+    def names_before_modes(self, k: int) -> list[str]:
+        """Names of the unknowns of frame `k` by row, before its modes; "" for a row without one."""
+        names = [*(unknown.name for unknown in self.unknowns), ""]
+        frame = self.frames[k]
+        return [names[row] for row in frame.rows[: frame.first_mode].tolist()]
+
     @cached_property
     def _scale(self) -> Tensor:
         """Units of the unknowns in which the curvature's diagonal is of order 1."""
@@ -311,7 +318,7 @@ class LinearModel:
         """Lower Cholesky factor of P + G G^T, in scaled units."""
         # Unknowns differ by many powers of ten. In the units U, U (P + G G^T) U is factored, whose
         # diagonal is 1.
-        system = self.curvature * self._scale[:, None] * self._scale
+        system = (self.curvature * self._scale[:, None]).mul_(self._scale)
         system.diagonal().add_((self._scale / self.deviation) ** 2)
         return torch.linalg.cholesky(system)
 
@@ -360,7 +367,12 @@ class LinearModel:
     @cached_property
     def _pattern_rows(self) -> Tensor:
         """R of the shared pattern, see `_pulled`, (unknowns, pixels), float32."""
-        return torch.cat(list(summed_rows(self.frames, len(self.vector))), dim=1)
+        # Filled piece by piece: to concatenate the pieces takes twice the memory.
+        count, pixels = len(self.vector), self.frames[0].weight.numel()
+        rows = torch.empty(count, pixels, dtype=torch.float32)
+        for piece, part in zip(pixel_pieces(pixels), summed_rows(self.frames, count), strict=True):
+            rows[:, piece] = part
+        return rows
 
     def _pulled(self, images: Mapping[int, Tensor]) -> Tensor:
         """J C^-1 x of images x, (k, ny, nx) by frame, (unknowns, k), float64."""
@@ -489,21 +501,21 @@ class LinearModel:
             Image of these unknowns by frame, in the data's unit.
         """
         keeps = torch.tensor([unknown.name != name for unknown in self.unknowns])
-        # `place` is the new index of every unknown that stays.
-        place = torch.cumsum(keeps, 0) - 1
+        # `place` is the new index of every unknown that stays. The Jacobians, the largest arrays,
+        # are shared: rows of the other unknowns are left without an unknown.
+        none = int(keeps.sum())
+        stays = torch.where(keeps, torch.cumsum(keeps, 0) - 1, none)
+        place = torch.cat([stays, torch.tensor([none])])
         frames = []
         for k, frame in enumerate(self.frames):
-            rows = keeps[frame.rows]
             counts = frame.weight > 0
             companions = torch.as_tensor(light.get(k, 0.0), dtype=torch.float64)
             frames.append(
                 replace(
                     frame,
                     residual=torch.where(counts, frame.residual + companions, 0.0),
-                    jacobian=frame.jacobian[rows],
-                    rows=place[frame.rows[rows]],
+                    rows=place[frame.rows],
                     drift=place[frame.drift],
-                    first_mode=frame.first_mode - int((~rows[: frame.first_mode]).sum()),
                 )
             )
         remaining = torch.nonzero(keeps).flatten()

@@ -241,7 +241,6 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
             models = [linear]
             if bool((distances < _OUTLIER_BESIDE_COMPANION_PIXELS).any()):
                 if star_only is None:
-                    # This model has its own copy of the Jacobians, as large as the fit's.
                     star_only = linear.without("companions", companions)
                 light = companions[k][max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
                 products = linear.weigh_pixels(k, pixel)
